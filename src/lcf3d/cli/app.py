@@ -1,0 +1,33 @@
+"""The ``lcf3d`` command: registers the verbs and turns errors into one sentence and exit code 2."""
+
+from __future__ import annotations
+
+import sys
+from importlib import import_module
+
+import typer
+
+from lcf3d.errors import Lcf3dError
+
+# verb -> module of lcf3d.cli that defines a function of that name; heavy imports stay inside the functions
+VERBS: dict[str, str] = {}
+
+app = typer.Typer(
+    name="lcf3d",
+    help="Late-cascade fusion of camera and LiDAR detections for 3D object detection.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+for verb, module in VERBS.items():
+    app.command(verb)(getattr(import_module(f"lcf3d.cli.{module}"), verb))
+
+
+def main() -> None:
+    """Entry point of the ``lcf3d`` command."""
+    try:
+        app()
+    except Lcf3dError as error:
+        typer.echo(f"error: {error}", err=True)
+        sys.exit(2)

@@ -1,0 +1,1 @@
+"""Readers of datasets, each yields Frames."""

@@ -1,0 +1,1 @@
+"""Detectors and the one-string way to name them."""

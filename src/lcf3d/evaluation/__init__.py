@@ -1,0 +1,1 @@
+"""Official metrics on plain arrays, curves and reports."""

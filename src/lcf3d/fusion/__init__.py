@@ -1,0 +1,1 @@
+"""The late-cascade fusion of the paper, one module a section."""

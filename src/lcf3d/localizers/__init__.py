@@ -1,0 +1,1 @@
+"""What puts a 3D box into a frustum."""
