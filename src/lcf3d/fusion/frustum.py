@@ -1,0 +1,244 @@
+"""Frustum proposals: the LiDAR points behind a 2D box (paper section 4.1.4; METHOD "Detection Recovery" 1-4)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from lcf3d.geometry.boxes import YAW, wrap_angle
+from lcf3d.geometry.camera import NEAR
+from lcf3d.structures import Camera, Detections2D, FloatArray, IntArray
+
+MaskMode = Literal["box", "mask", "box+mask"]
+
+
+@dataclass(frozen=True, eq=False)
+class FrustumProposals:
+    """The frustums of one frame, their points one after the other: proposal k owns ``offsets[k]:offsets[k + 1]``.
+
+    The frustum frame is the LiDAR frame turned about its vertical axis (about the LiDAR's origin) so that the frustum's
+    axis, the ray through the centre of its 2D box, points along +x.
+
+    Attributes:
+        points: (M, C) float32 ``x, y, z, intensity, ...``, x y z in each proposal's frustum frame.
+        gaussian: (M,) float32 the Gaussian mask G of the paper, 1 at the centre of the 2D box.
+        mask: (M,) float32, 1 for points on the instance mask; None unless the mode is ``box+mask``.
+        offsets: (K + 1,) where each proposal's points begin.
+        axis_yaw: (K,) heading of each frustum's axis in the LiDAR frame.
+        boxes2d: (K, 4) the 2D boxes in pixels, not enlarged.
+        scores: (K,) scores of the 2D detections.
+        labels: (K,) labels of the 2D detections, indices into ``class_names``.
+        camera_index: (K,) index into ``cameras``.
+        detection_index: (K,) index of the 2D detection in its camera's detections.
+        class_names: the class list of ``labels``.
+        cameras: the cameras of the frame.
+        cloud: (N, C) the whole scan in the LiDAR frame, for what needs the surroundings (such as the ground).
+    """
+
+    points: NDArray[np.float32]
+    gaussian: NDArray[np.float32]
+    mask: NDArray[np.float32] | None
+    offsets: IntArray
+    axis_yaw: FloatArray
+    boxes2d: FloatArray
+    scores: FloatArray
+    labels: IntArray
+    camera_index: IntArray
+    detection_index: IntArray
+    class_names: tuple[str, ...]
+    cameras: tuple[Camera, ...]
+    cloud: NDArray[np.float32]
+
+    def __len__(self) -> int:
+        return len(self.offsets) - 1
+
+    def part(self, k: int) -> slice:
+        """Where proposal ``k``'s points lie in ``points``, ``gaussian`` and ``mask``."""
+        return slice(int(self.offsets[k]), int(self.offsets[k + 1]))
+
+    def lidar_from_frustum(self, boxes: FloatArray) -> FloatArray:
+        """(K, 7) boxes, one a proposal in its frustum frame, turned back into the LiDAR frame."""
+        result = np.array(boxes, dtype=np.float64)
+        cos, sin = np.cos(self.axis_yaw), np.sin(self.axis_yaw)
+        result[:, 0] = cos * boxes[:, 0] - sin * boxes[:, 1]
+        result[:, 1] = sin * boxes[:, 0] + cos * boxes[:, 1]
+        result[:, YAW] = wrap_angle(boxes[:, YAW] + self.axis_yaw)
+        return result
+
+    def frustum_from_lidar(self, boxes: FloatArray) -> FloatArray:
+        """(K, 7) boxes, one a proposal in the LiDAR frame, turned into the frustum frames."""
+        result = np.array(boxes, dtype=np.float64)
+        cos, sin = np.cos(self.axis_yaw), np.sin(self.axis_yaw)
+        result[:, 0] = cos * boxes[:, 0] + sin * boxes[:, 1]
+        result[:, 1] = cos * boxes[:, 1] - sin * boxes[:, 0]
+        result[:, YAW] = wrap_angle(boxes[:, YAW] - self.axis_yaw)
+        return result
+
+
+@njit(cache=True, nogil=True)
+def points_in_image_boxes(points, projection, near, boxes):  # type: ignore[no-untyped-def]
+    """Points whose projection falls in image boxes (numba).
+
+    Args:
+        points: (N, 3 or more) LiDAR-frame points; NaN ones are in no box.
+        projection: (3, 4) pixels from LiDAR.
+        near: least depth in metres.
+        boxes: (K, 4) pixel boxes.
+
+    Returns:
+        (P,) point indices ordered by box then point, (P, 2) their pixels, (K + 1,) where each box's points begin.
+    """
+    count = np.zeros(len(boxes) + 1, np.int64)
+    hit_point = np.empty(1024, np.int64)
+    hit_box = np.empty(1024, np.int64)
+    hit_pixel = np.empty((1024, 2))
+    hits = 0
+    u1, v1, u2, v2 = np.inf, np.inf, -np.inf, -np.inf
+    for k in range(len(boxes)):
+        u1, v1 = min(u1, boxes[k, 0]), min(v1, boxes[k, 1])
+        u2, v2 = max(u2, boxes[k, 2]), max(v2, boxes[k, 3])
+    for n in range(len(points)):
+        x, y, z = points[n, 0], points[n, 1], points[n, 2]
+        w = projection[2, 0] * x + projection[2, 1] * y + projection[2, 2] * z + projection[2, 3]
+        if not w > near:
+            continue
+        u = (projection[0, 0] * x + projection[0, 1] * y + projection[0, 2] * z + projection[0, 3]) / w
+        if not (u1 <= u <= u2):
+            continue
+        v = (projection[1, 0] * x + projection[1, 1] * y + projection[1, 2] * z + projection[1, 3]) / w
+        if not (v1 <= v <= v2):
+            continue
+        for k in range(len(boxes)):
+            if boxes[k, 0] <= u <= boxes[k, 2] and boxes[k, 1] <= v <= boxes[k, 3]:
+                if hits == len(hit_point):
+                    hit_point = np.concatenate((hit_point, np.empty(hits, np.int64)))
+                    hit_box = np.concatenate((hit_box, np.empty(hits, np.int64)))
+                    hit_pixel = np.concatenate((hit_pixel, np.empty((hits, 2))))
+                hit_point[hits], hit_box[hits] = n, k
+                hit_pixel[hits, 0], hit_pixel[hits, 1] = u, v
+                count[k + 1] += 1
+                hits += 1
+    offsets = np.cumsum(count)
+    cursor = offsets.copy()
+    index = np.empty(hits, np.int64)
+    pixels = np.empty((hits, 2))
+    for i in range(hits):
+        at = cursor[hit_box[i]]
+        index[at] = hit_point[i]
+        pixels[at] = hit_pixel[i]
+        cursor[hit_box[i]] += 1
+    return index, pixels, offsets
+
+
+def enlarge_boxes(boxes: FloatArray, enlargement: float) -> FloatArray:
+    """(K, 4) pixel boxes with width and height multiplied by ``1 + enlargement`` about their centres."""
+    centres, sides = (boxes[:, :2] + boxes[:, 2:]) / 2, boxes[:, 2:] - boxes[:, :2]
+    half = sides * (1 + enlargement) / 2
+    return np.concatenate([centres - half, centres + half], axis=1)
+
+
+def gaussian_mask(pixels: FloatArray, box: FloatArray) -> NDArray[np.float32]:
+    """(N,) G of the paper (section 4.1.4) at (N, 2) pixels: sigma is the width and height of the (4,) 2D box."""
+    centre = (box[:2] + box[2:]) / 2
+    sides = np.maximum(box[2:] - box[:2], 1e-6)
+    exponent = ((pixels - centre) / sides) ** 2
+    return np.exp(-0.5 * exponent.sum(axis=1)).astype(np.float32)
+
+
+def axis_yaws(boxes: FloatArray, camera: Camera) -> FloatArray:
+    """(K,) headings in the LiDAR frame of the rays through the centres of (K, 4) pixel boxes."""
+    centres = np.concatenate([(boxes[:, :2] + boxes[:, 2:]) / 2, np.ones((len(boxes), 1))], axis=1)
+    rays = centres @ np.linalg.inv(camera.pixels_from_lidar[:, :3]).T
+    yaws: FloatArray = np.arctan2(rays[:, 1], rays[:, 0])
+    return yaws
+
+
+def extract_frustums(
+    points: NDArray[np.float32],
+    cameras: Sequence[Camera],
+    detections: Sequence[Detections2D],
+    selected: Sequence[IntArray],
+    *,
+    enlargement: float = 0.05,
+    min_points: int = 10,
+    mask_mode: MaskMode = "box",
+) -> FrustumProposals:
+    """Frustum proposals of the selected 2D detections of all cameras, those with too few points left out.
+
+    Args:
+        points: (N, 4 or more) float32 scan in the LiDAR frame; non-finite points are in no frustum.
+        cameras: the cameras.
+        detections: for each camera its 2D detections.
+        selected: for each camera the indices of the detections to lift.
+        enlargement: ``e``, by which width and height of the 2D boxes grow before points are taken.
+        min_points: ``p_min``, fewest points of a proposal.
+        mask_mode: ``box`` takes all points in the box; ``mask`` only those on the instance mask, or the box where the
+            mask keeps fewer than ``min_points``; ``box+mask`` takes the box and marks the points on the mask.
+    """
+    parts: list[tuple[FloatArray, NDArray[np.float32], NDArray[np.float32]]] = []
+    rows: list[tuple[int, int, float]] = []
+    for c, (camera, found, chosen) in enumerate(zip(cameras, detections, selected, strict=True)):
+        if not len(chosen):
+            continue
+        boxes = found.boxes[chosen]
+        index, pixels, offsets = points_in_image_boxes(
+            points, np.array(camera.pixels_from_lidar), NEAR, enlarge_boxes(boxes, enlargement)
+        )
+        yaws = axis_yaws(boxes, camera)
+        for k, d in enumerate(chosen):
+            inside, at = index[offsets[k] : offsets[k + 1]], pixels[offsets[k] : offsets[k + 1]]
+            on_mask = np.ones(len(inside), dtype=bool)
+            instance = found.masks[d] if found.masks is not None else None
+            if mask_mode != "box" and instance is not None:
+                on_mask = instance.contains(at)
+                if mask_mode == "mask" and on_mask.sum() >= min_points:
+                    inside, at, on_mask = inside[on_mask], at[on_mask], on_mask[on_mask]
+            if len(inside) >= min_points:
+                turned = _turn(points[inside], -yaws[k])
+                parts.append((turned, gaussian_mask(at, boxes[k]), on_mask.astype(np.float32)))
+                rows.append((c, int(d), float(yaws[k])))
+    return _assemble(points, cameras, detections, parts, rows, mask_mode)
+
+
+def _turn(points: NDArray[np.float32], angle: float) -> NDArray[np.float32]:
+    """Points turned counter-clockwise about the vertical axis."""
+    turned = points.copy()
+    cos, sin = np.float32(np.cos(angle)), np.float32(np.sin(angle))
+    turned[:, 0] = cos * points[:, 0] - sin * points[:, 1]
+    turned[:, 1] = sin * points[:, 0] + cos * points[:, 1]
+    return turned
+
+
+def _assemble(
+    points: NDArray[np.float32],
+    cameras: Sequence[Camera],
+    detections: Sequence[Detections2D],
+    parts: list[tuple[FloatArray, NDArray[np.float32], NDArray[np.float32]]],
+    rows: list[tuple[int, int, float]],
+    mask_mode: MaskMode,
+) -> FrustumProposals:
+    """The proposals' parts laid one after the other."""
+    chosen = [detections[c][[d]] for c, d, _ in rows]
+    gaussian = [p[1] for p in parts]
+    mask = [p[2] for p in parts]
+    nothing = np.zeros(0, np.float32)
+    return FrustumProposals(
+        points=np.concatenate([p[0] for p in parts]) if parts else points[:0],
+        gaussian=np.concatenate(gaussian) if parts else nothing,
+        mask=(np.concatenate(mask) if parts else nothing) if mask_mode == "box+mask" else None,
+        offsets=np.cumsum([0, *(len(p[0]) for p in parts)]).astype(np.int64),
+        axis_yaw=np.array([yaw for _, _, yaw in rows], dtype=np.float64),
+        boxes2d=np.concatenate([d.boxes for d in chosen]) if chosen else np.zeros((0, 4)),
+        scores=np.array([d.scores[0] for d in chosen], dtype=np.float64),
+        labels=np.array([d.labels[0] for d in chosen], dtype=np.int64),
+        camera_index=np.array([c for c, _, _ in rows], dtype=np.int64),
+        detection_index=np.array([d for _, d, _ in rows], dtype=np.int64),
+        class_names=detections[0].class_names if detections else (),
+        cameras=tuple(cameras),
+        cloud=points,
+    )

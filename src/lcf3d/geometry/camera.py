@@ -1,0 +1,84 @@
+"""Projection of boxes and points into cameras, with near-plane clipping and visibility."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from lcf3d.geometry.boxes import EDGES, box_corners
+from lcf3d.structures import BoolArray, Camera, FloatArray
+
+# nothing nearer to the camera than this is projected, in metres
+NEAR = 0.1
+
+
+def project_points(points: NDArray[np.floating], camera: Camera) -> tuple[FloatArray, FloatArray]:
+    """Pixels (N, 2) and depths (N,) of (N, 3 or more) LiDAR-frame points; pixels are NaN where depth <= `NEAR`."""
+    homogeneous = points[:, :3] @ camera.pixels_from_lidar[:, :3].T + camera.pixels_from_lidar[:, 3]
+    depths = homogeneous[:, 2]
+    pixels = np.full((len(points), 2), np.nan)
+    front = depths > NEAR
+    pixels[front] = homogeneous[front, :2] / depths[front, None]
+    return pixels, depths
+
+
+@njit(cache=True, nogil=True)
+def _bound_projections(corners, edges, projection, near, bounds):  # type: ignore[no-untyped-def]
+    """Fill ``bounds`` (N, 4) with the extent of each box's projection in front of the near plane, inf where none."""
+    homogeneous = np.empty((8, 3))
+    for n in range(len(corners)):
+        x1 = y1 = np.inf
+        x2 = y2 = -np.inf
+        behind = 0
+        for c in range(8):
+            for r in range(3):
+                homogeneous[c, r] = (
+                    projection[r, 0] * corners[n, c, 0]
+                    + projection[r, 1] * corners[n, c, 1]
+                    + projection[r, 2] * corners[n, c, 2]
+                    + projection[r, 3]
+                )
+            if homogeneous[c, 2] >= near:
+                u, v = homogeneous[c, 0] / homogeneous[c, 2], homogeneous[c, 1] / homogeneous[c, 2]
+                x1, x2, y1, y2 = min(x1, u), max(x2, u), min(y1, v), max(y2, v)
+            else:
+                behind += 1
+        if 0 < behind < 8:
+            for e in range(len(edges)):
+                a, b = edges[e, 0], edges[e, 1]
+                da, db = homogeneous[a, 2] - near, homogeneous[b, 2] - near
+                if (da >= 0) != (db >= 0):
+                    t = da / (da - db)
+                    u = (homogeneous[a, 0] + t * (homogeneous[b, 0] - homogeneous[a, 0])) / near
+                    v = (homogeneous[a, 1] + t * (homogeneous[b, 1] - homogeneous[a, 1])) / near
+                    x1, x2, y1, y2 = min(x1, u), max(x2, u), min(y1, v), max(y2, v)
+        bounds[n, 0], bounds[n, 1], bounds[n, 2], bounds[n, 3] = x1, y1, x2, y2
+
+
+def project_boxes(boxes: FloatArray, camera: Camera) -> tuple[FloatArray, BoolArray]:
+    """Image boxes of 3D boxes (METHOD "Projection and visibility"; paper section 4.1.3).
+
+    Each box is cut at the near plane, projected, bounded by an axis-aligned rectangle and clipped to the image.
+
+    Args:
+        boxes: (N, 7) canonical boxes.
+        camera: where to project.
+
+    Returns:
+        (N, 4) pixel boxes clipped to the image, zeros where not visible; and (N,) whether they have positive area.
+    """
+    bounds = np.empty((len(boxes), 4))
+    _bound_projections(box_corners(boxes), EDGES, np.array(camera.pixels_from_lidar), NEAR, bounds)
+    clipped = np.empty_like(bounds)
+    np.clip(bounds[:, 0::2], 0, camera.width, out=clipped[:, 0::2])
+    np.clip(bounds[:, 1::2], 0, camera.height, out=clipped[:, 1::2])
+    visible = (clipped[:, 2] > clipped[:, 0]) & (clipped[:, 3] > clipped[:, 1])
+    clipped[~visible] = 0
+    return clipped, visible
+
+
+def depths_of(points: NDArray[np.floating], camera: Camera) -> FloatArray:
+    """(N,) depths in metres of (N, 3) LiDAR-frame points along the camera's optical axis."""
+    depths: FloatArray = points[:, :3] @ camera.pixels_from_lidar[2, :3] + camera.pixels_from_lidar[2, 3]
+    return depths
