@@ -1,0 +1,130 @@
+"""The two branches' detections made ready for the fusion: classes, scores, thresholds, cameras that are there."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from lcf3d.errors import ConfigError
+from lcf3d.fusion.config import FusionConfig
+from lcf3d.provenance import Decisions, Reason
+from lcf3d.structures import Camera, Detections2D, Detections3D, Frame, IntArray
+
+
+class Branches(NamedTuple):
+    """What takes part in the fusion of one frame.
+
+    Attributes:
+        lidar: 3D detections that take part, labels in the fusion's class list.
+        lidar_index: (N,) their indices in the detections given.
+        cameras: the cameras used.
+        camera: for each of them its 2D detections that take part, labels in the fusion's class list.
+        camera_index: for each of them their indices in the detections given.
+        camera_start: for each of them the row of its first detection in the table of camera decisions.
+        lidar_table: decisions so far on all 3D detections given.
+        camera_table: decisions so far on all 2D detections given, camera after camera.
+        camera_inputs: for each camera used, the 2D detections given.
+        notes: what was missing or left out.
+    """
+
+    lidar: Detections3D
+    lidar_index: IntArray
+    cameras: tuple[Camera, ...]
+    camera: tuple[Detections2D, ...]
+    camera_index: tuple[IntArray, ...]
+    camera_start: tuple[int, ...]
+    lidar_table: Decisions
+    camera_table: Decisions
+    camera_inputs: tuple[Detections2D, ...]
+    notes: tuple[str, ...]
+
+
+def prepare_branches(
+    frame: Frame, lidar: Detections3D, camera: Mapping[str, Detections2D], config: FusionConfig
+) -> Branches:
+    """Select what takes part in the fusion, and write down what does not and why.
+
+    Raises:
+        ConfigError: scores outside [0, 1], detections of a camera that the frame does not have, or a class list that
+            shares no name with the classes to detect.
+    """
+    cameras = [c for c in frame.cameras if c.name in camera]
+    unknown = sorted(set(camera) - {c.name for c in frame.cameras})
+    if unknown:
+        known = [c.name for c in frame.cameras]
+        raise ConfigError(f"frame {frame.id}: detections of cameras {unknown}, but its cameras are {known}")
+    notes = [
+        f"camera {c.name} has no detections and was not used: nobody looked there"
+        for c in frame.cameras
+        if c.name not in camera
+    ]
+    lidar_table, lidar_index = _select(lidar, config, config.lidar_score_threshold, f"frame {frame.id}: LiDAR")
+    lidar_table.lidar[:] = np.arange(len(lidar))
+    lidar_table.lidar_score[:] = lidar.scores
+    lidar_index = _cap(lidar, lidar_index, lidar_table, config.max_boxes)
+
+    tables, chosen = [], []
+    for c, view in enumerate(cameras):
+        found = camera[view.name]
+        table, index = _select(found, config, config.camera_score_threshold, f"frame {frame.id}, camera {view.name}:")
+        table.camera[:], table.detection[:], table.camera_score[:] = c, np.arange(len(found)), found.scores
+        tables.append(table)
+        chosen.append(index)
+    return Branches(
+        lidar=lidar[lidar_index].with_classes(config.class_names),
+        lidar_index=lidar_index,
+        cameras=tuple(cameras),
+        camera=tuple(camera[v.name][i].with_classes(config.class_names) for v, i in zip(cameras, chosen, strict=True)),
+        camera_index=tuple(chosen),
+        camera_start=tuple(int(s) for s in np.cumsum([0, *(len(t) for t in tables)])[:-1]),
+        lidar_table=lidar_table,
+        camera_table=_join(tables),
+        camera_inputs=tuple(camera[v.name] for v in cameras),
+        notes=tuple(notes),
+    )
+
+
+def _select(
+    detections: Detections2D | Detections3D, config: FusionConfig, threshold: float, who: str
+) -> tuple[Decisions, IntArray]:
+    """A table with the reason of what is left out, and the indices of what takes part."""
+    scores = detections.scores
+    if len(scores) and not (np.nanmin(scores) >= 0 and np.nanmax(scores) <= 1 and np.isfinite(scores).all()):
+        raise ConfigError(
+            f"{who} scores must lie in [0, 1], got {np.min(scores):.4g} to {np.max(scores):.4g}; "
+            "fit a calibration with 'lcf3d calibrate' and pass it"
+        )
+    if len(scores) and not set(detections.class_names) & set(config.class_names):
+        raise ConfigError(
+            f"{who} classes {list(detections.class_names)} share no name with the classes to detect "
+            f"{list(config.class_names)}; map them with Detections.with_classes"
+        )
+    table = Decisions.blank(len(detections))
+    wanted = np.array([name in config.class_names for name in detections.class_names], dtype=bool)
+    of_class = wanted[detections.labels] if len(scores) else np.zeros(0, dtype=bool)
+    boxes = detections.boxes
+    sides = boxes[:, 3:6] if isinstance(detections, Detections3D) else boxes[:, 2:] - boxes[:, :2]
+    valid = np.isfinite(boxes).all(axis=1) & (sides > 0).all(axis=1)
+    table.reason[~of_class] = Reason.OTHER_CLASS
+    table.reason[~valid] = Reason.INVALID
+    return table, np.flatnonzero(of_class & valid & (scores > threshold))
+
+
+def _cap(lidar: Detections3D, index: IntArray, table: Decisions, max_boxes: int) -> IntArray:
+    """The ``max_boxes`` highest-scoring of ``index``, in input order; the rest marked."""
+    if len(index) <= max_boxes:
+        return index
+    order = np.argsort(-lidar.scores[index], kind="stable")
+    table.reason[index[order[max_boxes:]]] = Reason.TOO_MANY
+    kept: IntArray = np.sort(index[order[:max_boxes]])
+    return kept
+
+
+def _join(tables: Sequence[Decisions]) -> Decisions:
+    """All rows one after the other."""
+    if not tables:
+        return Decisions.blank(0)
+    columns = Decisions.__dataclass_fields__
+    return Decisions(**{name: np.concatenate([getattr(t, name) for t in tables]) for name in columns})

@@ -1,0 +1,206 @@
+"""What becomes of every cluster and candidate: the output detections and the table of reasons."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from lcf3d.fusion.branches import Branches
+from lcf3d.fusion.clustering import SUPPRESSED, Clusters
+from lcf3d.fusion.config import FusionConfig
+from lcf3d.fusion.matching import Matches, View
+from lcf3d.fusion.recovery import Recovery
+from lcf3d.fusion.semantic import fuse_scores, semantic_fusion
+from lcf3d.geometry.iou import bev_iou
+from lcf3d.provenance import FusedDetections, Reason, Stage
+from lcf3d.structures import Detections3D, FloatArray, IntArray
+
+
+class ClusterOutcome(NamedTuple):
+    """One row a cluster.
+
+    Attributes:
+        box: (C,) the LiDAR detection that stands for the cluster.
+        stage: (C,) `Stage` codes.
+        reason: (C,) `Reason` codes.
+        scores: (C,) scores after fusion.
+        labels: (C,) labels after fusion.
+    """
+
+    box: IntArray
+    stage: IntArray
+    reason: IntArray
+    scores: FloatArray
+    labels: IntArray
+
+
+def decide_clusters(branches: Branches, clusters: Clusters, matches: Matches, config: FusionConfig) -> ClusterOutcome:
+    """Semantic fusion for matched clusters (Algorithm 1), the chosen policy for all others (METHOD, matching 5-6)."""
+    lidar = branches.lidar
+    matched = np.flatnonzero(matches.camera >= 0)
+    camera_scores, camera_labels = _matched_detections(branches, matches, matched)
+    box = clusters.representative.copy()
+    if config.representative == "camera_class":
+        box[matched] = [
+            _best_of_class(lidar, clusters, c, label) for c, label in zip(matched, camera_labels, strict=True)
+        ]
+    scores, labels = lidar.scores[box], lidar.labels[box]
+    stage = np.full(len(box), Stage.KEPT, dtype=np.int64)
+    reason = np.full(len(box), Reason.UNCONFIRMED, dtype=np.int64)
+
+    scores[matched], labels[matched] = semantic_fusion(
+        scores[matched], labels[matched], camera_scores, camera_labels, config.prior_array(), config.ensemble
+    )
+    stage[matched], reason[matched] = Stage.MATCHED, Reason.CONFIRMED
+
+    unseen = ~matches.visible
+    unseen[matched] = False
+    reason[unseen] = Reason.OUT_OF_VIEW
+    # with no camera at all nobody could look: the LiDAR branch then stands alone
+    if config.out_of_view == "drop" and branches.cameras:
+        stage[unseen] = Stage.DROPPED
+    unconfirmed = matches.visible & (matches.camera < 0)
+    if config.unmatched == "drop":
+        stage[unconfirmed] = Stage.DROPPED
+    elif config.unmatched == "downweight":
+        reason[unconfirmed] = Reason.DOWNWEIGHTED
+        count = int(unconfirmed.sum())
+        scores[unconfirmed] = fuse_scores(
+            scores[unconfirmed], np.full(count, config.miss_likelihood), np.full(count, 0.5), "probabilistic"
+        )
+    return ClusterOutcome(box, stage, reason, scores, labels)
+
+
+def _matched_detections(branches: Branches, matches: Matches, matched: IntArray) -> tuple[FloatArray, IntArray]:
+    """Scores and labels of the primary 2D detections of the matched clusters."""
+    scores, labels = np.empty(len(matched)), np.empty(len(matched), dtype=np.int64)
+    for c, found in enumerate(branches.camera):
+        here = matches.camera[matched] == c
+        scores[here] = found.scores[matches.detection[matched[here]]]
+        labels[here] = found.labels[matches.detection[matched[here]]]
+    return scores, labels
+
+
+def _best_of_class(lidar: Detections3D, clusters: Clusters, cluster: int, label: int) -> int:
+    """The highest-scoring member of a class, or of all classes where the cluster has none of it."""
+    members = np.flatnonzero((clusters.index == cluster) & (lidar.labels == label))
+    if not len(members):
+        return int(clusters.representative[cluster])
+    return int(members[np.argmax(lidar.scores[members])])
+
+
+def replace_unconfirmed(
+    outcome: ClusterOutcome, lidar: Detections3D, recovery: Recovery, duplicate_iou: float
+) -> ClusterOutcome:
+    """Drop clusters kept without confirmation on whose spot a recovered box stands: one object comes out once."""
+    kept = np.flatnonzero(np.isin(outcome.reason, [Reason.UNCONFIRMED, Reason.DOWNWEIGHTED]))
+    kept = kept[outcome.stage[kept] == Stage.KEPT]
+    if not len(kept) or not len(recovery.found):
+        return outcome
+    overlap = bev_iou(lidar.boxes[outcome.box[kept]], recovery.boxes[recovery.found])
+    gone = kept[(overlap > duplicate_iou).any(axis=1)]
+    stage, reason = outcome.stage.copy(), outcome.reason.copy()
+    stage[gone], reason[gone] = Stage.DROPPED, Reason.REPLACED
+    return outcome._replace(stage=stage, reason=reason)
+
+
+def assemble(
+    branches: Branches,
+    clusters: Clusters,
+    views: Sequence[View],
+    matches: Matches,
+    outcome: ClusterOutcome,
+    recovery: Recovery,
+    notes: Sequence[str],
+) -> FusedDetections:
+    """Output detections, highest score first, and the reason for every input."""
+    surviving = np.flatnonzero(outcome.stage != Stage.DROPPED)
+    found = recovery.found
+    lidar = branches.lidar[outcome.box[surviving]]
+    detections = Detections3D.concatenate(
+        [
+            Detections3D(
+                lidar.boxes,
+                outcome.scores[surviving],
+                outcome.labels[surviving],
+                lidar.class_names,
+                lidar.velocities,
+                lidar.attributes,
+            ),
+            Detections3D(recovery.boxes[found], recovery.scores[found], recovery.labels[found], lidar.class_names),
+        ]
+    )
+    order = np.lexsort((*detections.boxes.T[::-1], -detections.scores))
+    place = np.empty(len(order), dtype=np.int64)
+    place[order] = np.arange(len(order))
+    cluster_output = np.full(len(clusters), -1, dtype=np.int64)
+    cluster_output[surviving] = place[: len(surviving)]
+
+    _write_lidar_rows(branches, clusters, matches, outcome, cluster_output)
+    _write_camera_rows(branches, views, matches, outcome, cluster_output)
+    _write_recovery_rows(branches, recovery, place[len(surviving) :])
+    return FusedDetections(
+        detections=detections[order],
+        lidar=branches.lidar_table,
+        camera=branches.camera_table,
+        lidar_inputs=Detections3D.empty(lidar.class_names),
+        camera_inputs=branches.camera_inputs,
+        camera_names=tuple(c.name for c in branches.cameras),
+        notes=(*branches.notes, *notes),
+    )
+
+
+def _write_lidar_rows(
+    branches: Branches, clusters: Clusters, matches: Matches, outcome: ClusterOutcome, cluster_output: IntArray
+) -> None:
+    """Fill the rows of the 3D detections that took part."""
+    table, rows = branches.lidar_table, branches.lidar_index
+    table.cluster[rows] = clusters.index
+    table.reason[rows] = np.where(clusters.index == SUPPRESSED, Reason.SUPPRESSED, Reason.IN_CLUSTER)
+    own = rows[outcome.box]
+    table.stage[own], table.reason[own] = outcome.stage, outcome.reason
+    table.camera[own], table.iou[own] = matches.camera, matches.iou
+    table.output[own] = cluster_output
+    lasting = outcome.stage != Stage.DROPPED
+    table.score[own[lasting]] = outcome.scores[lasting]
+    for c, chosen in enumerate(branches.camera_index):
+        here = matches.camera == c
+        table.detection[own[here]] = chosen[matches.detection[here]]
+        table.camera_score[own[here]] = branches.camera[c].scores[matches.detection[here]]
+
+
+def _write_camera_rows(
+    branches: Branches, views: Sequence[View], matches: Matches, outcome: ClusterOutcome, cluster_output: IntArray
+) -> None:
+    """Fill the rows of the 2D detections that matched a cluster, in their primary camera or in another."""
+    table = branches.camera_table
+    for c, (view, chosen, start) in enumerate(zip(views, branches.camera_index, branches.camera_start, strict=True)):
+        cluster = np.flatnonzero(view.match >= 0)
+        detection = view.match[cluster]
+        rows = start + chosen[detection]
+        primary = (matches.camera[cluster] == c) & (matches.detection[cluster] == detection)
+        table.stage[rows] = Stage.MATCHED
+        table.reason[rows] = np.where(primary, Reason.CONFIRMED, Reason.OTHER_VIEW)
+        table.cluster[rows] = cluster
+        table.lidar[rows] = branches.lidar_index[outcome.box[cluster]]
+        table.lidar_score[rows] = branches.lidar.scores[outcome.box[cluster]]
+        table.iou[rows] = view.iou[cluster, detection]
+        table.score[rows] = outcome.scores[cluster]
+        table.output[rows] = cluster_output[cluster]
+
+
+def _write_recovery_rows(branches: Branches, recovery: Recovery, outputs: IntArray) -> None:
+    """Fill the rows of the 2D detections that were candidates for recovery."""
+    table = branches.camera_table
+    if not len(recovery.camera):
+        return
+    starts = np.array(branches.camera_start, dtype=np.int64)
+    rows = np.array(
+        [starts[c] + branches.camera_index[c][d] for c, d in zip(recovery.camera, recovery.detection, strict=True)]
+    )
+    table.reason[rows], table.iou[rows] = recovery.reason, recovery.iou
+    found = recovery.found
+    table.stage[rows[found]] = Stage.RECOVERED
+    table.score[rows[found]], table.output[rows[found]] = recovery.scores[found], outputs

@@ -1,0 +1,251 @@
+"""What the fusion returns: detections, and for every input and output the reason why it is there or not."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from enum import IntEnum
+from typing import Any
+
+import numpy as np
+
+from lcf3d.structures import Detections2D, Detections3D, FloatArray, IntArray
+
+
+class Stage(IntEnum):
+    """Where in the fusion an input was decided."""
+
+    MATCHED = 0
+    RECOVERED = 1
+    KEPT = 2
+    DROPPED = 3
+
+
+class Reason(IntEnum):
+    """Why; the sentence for people is `REASON_TEXT`."""
+
+    CONFIRMED = 0
+    IN_CLUSTER = 1
+    UNCONFIRMED = 2
+    DOWNWEIGHTED = 3
+    OUT_OF_VIEW = 4
+    LOW_SCORE = 5
+    OTHER_CLASS = 6
+    TOO_MANY = 7
+    SUPPRESSED = 8
+    REPLACED = 9
+    LOCALIZED = 10
+    FEW_POINTS = 11
+    NOT_LOCALIZED = 12
+    DISAGREES = 13
+    DUPLICATE = 14
+    SEEN_ELSEWHERE = 15
+    NO_RECOVERY = 16
+    NO_SCAN = 17
+    OTHER_VIEW = 18
+    INVALID = 19
+
+
+REASON_TEXT = {
+    Reason.CONFIRMED: "a camera detection confirms the cluster",
+    Reason.IN_CLUSTER: "a box of higher score represents its cluster",
+    Reason.UNCONFIRMED: "it is in view of a camera and no camera detection confirms it",
+    Reason.DOWNWEIGHTED: "no camera detection confirms it, its score is lowered by the camera's miss likelihood",
+    Reason.OUT_OF_VIEW: "no camera that was used looks at it",
+    Reason.LOW_SCORE: "its score is not above the threshold",
+    Reason.OTHER_CLASS: "its class is not among the classes to detect",
+    Reason.TOO_MANY: "the frame has more boxes of higher score than max_boxes",
+    Reason.SUPPRESSED: "non-maximum suppression: it overlaps a box of higher score",
+    Reason.REPLACED: "a box recovered from a camera detection stands in its place",
+    Reason.LOCALIZED: "the frustum localizer found the object that the LiDAR detector missed",
+    Reason.FEW_POINTS: "its frustum holds too few LiDAR points",
+    Reason.NOT_LOCALIZED: "the localizer found no object in its frustum",
+    Reason.DISAGREES: "the localized box, projected, does not overlap it enough",
+    Reason.DUPLICATE: "the localized box overlaps a confirmed one",
+    Reason.SEEN_ELSEWHERE: "its object is already confirmed through another camera",
+    Reason.NO_RECOVERY: "no LiDAR box matches it and recovery is off",
+    Reason.NO_SCAN: "no LiDAR box matches it and there is no scan to recover it from",
+    Reason.OTHER_VIEW: "its object is matched better in another camera",
+    Reason.INVALID: "its box is not finite or has no size",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Decisions:
+    """One row an input, in the order of the inputs; -1 and NaN stand for none.
+
+    Attributes:
+        stage: `Stage` codes.
+        reason: `Reason` codes.
+        cluster: cluster of the LiDAR box, or of the LiDAR box that a camera detection matched.
+        lidar: index of the LiDAR detection (for camera rows: of the representative it matched).
+        camera: index into ``FusedDetections.camera_names`` of the camera (for LiDAR rows: of the primary match).
+        detection: index of the 2D detection within its camera.
+        iou: image IoU that decided.
+        lidar_score: score of the LiDAR detection before fusion.
+        camera_score: score of the 2D detection before fusion.
+        score: score after fusion.
+        output: index of the output detection this input led to.
+    """
+
+    stage: IntArray
+    reason: IntArray
+    cluster: IntArray
+    lidar: IntArray
+    camera: IntArray
+    detection: IntArray
+    iou: FloatArray
+    lidar_score: FloatArray
+    camera_score: FloatArray
+    score: FloatArray
+    output: IntArray
+
+    @classmethod
+    def blank(cls, n: int) -> Decisions:
+        """``n`` rows of dropped inputs, all else unset; the fusion fills its columns."""
+        none, nan = np.full(n, -1, dtype=np.int64), np.full(n, np.nan)
+        return cls(
+            stage=np.full(n, Stage.DROPPED, dtype=np.int64),
+            reason=np.full(n, Reason.LOW_SCORE, dtype=np.int64),
+            cluster=none.copy(),
+            lidar=none.copy(),
+            camera=none.copy(),
+            detection=none.copy(),
+            iou=nan.copy(),
+            lidar_score=nan.copy(),
+            camera_score=nan.copy(),
+            score=nan.copy(),
+            output=none.copy(),
+        )
+
+    def __len__(self) -> int:
+        return len(self.stage)
+
+    def row(self, index: int) -> dict[str, Any]:
+        """One row in words and numbers, None where unset."""
+        result: dict[str, Any] = {
+            "stage": Stage(self.stage[index]).name.lower(),
+            "reason": Reason(self.reason[index]).name.lower(),
+        }
+        for name in ("cluster", "lidar", "camera", "detection", "output"):
+            value = int(getattr(self, name)[index])
+            result[name] = value if value >= 0 else None
+        for name in ("iou", "lidar_score", "camera_score", "score"):
+            number = float(getattr(self, name)[index])
+            result[name] = None if np.isnan(number) else number
+        return result
+
+    @classmethod
+    def from_rows(cls, rows: Sequence[dict[str, Any]]) -> Decisions:
+        """The inverse of `row` over all rows."""
+        decisions = cls.blank(len(rows))
+        for i, row in enumerate(rows):
+            decisions.stage[i] = Stage[row["stage"].upper()]
+            decisions.reason[i] = Reason[row["reason"].upper()]
+            for column in fields(cls)[2:]:
+                if row[column.name] is not None:
+                    getattr(decisions, column.name)[i] = row[column.name]
+        return decisions
+
+
+@dataclass(frozen=True, eq=False)
+class FusedDetections:
+    """Result of the fusion of one frame.
+
+    Attributes:
+        detections: (N) the fused 3D detections, highest score first.
+        lidar: decisions on the LiDAR detections, one row each, in input order.
+        camera: decisions on the camera detections, camera after camera, in input order.
+        lidar_inputs: the LiDAR detections that were given.
+        camera_inputs: the 2D detections that were given, by position in ``camera_names``.
+        camera_names: the cameras that were used.
+        notes: what was missing or left out, one sentence each.
+    """
+
+    detections: Detections3D
+    lidar: Decisions
+    camera: Decisions
+    lidar_inputs: Detections3D
+    camera_inputs: tuple[Detections2D, ...]
+    camera_names: tuple[str, ...]
+    notes: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.detections)
+
+    @property
+    def stages(self) -> IntArray:
+        """(N,) `Stage` of every output."""
+        stages = np.full(len(self.detections), Stage.KEPT, dtype=np.int64)
+        for table in (self.camera, self.lidar):
+            led = table.output >= 0
+            stages[table.output[led]] = table.stage[led]
+        return stages
+
+    @property
+    def dropped_lidar(self) -> IntArray:
+        """Indices of the LiDAR detections that were dropped, without those that another box of theirs represents."""
+        merged = np.isin(self.lidar.reason, [Reason.IN_CLUSTER, Reason.SUPPRESSED])
+        return np.flatnonzero((self.lidar.stage == Stage.DROPPED) & ~merged)
+
+    def explain(self, output: int) -> str:
+        """One sentence on why output ``output`` is there, with the numbers that decided."""
+        table, row = self._origin(output)
+        reason = REASON_TEXT[Reason(table.reason[row])]
+        parts = []
+        if table.lidar[row] >= 0:
+            parts.append(f"LiDAR detection {table.lidar[row]} (score {table.lidar_score[row]:.2f})")
+        if table.camera[row] >= 0:
+            name = self.camera_names[table.camera[row]]
+            parts.append(f"{name} detection {table.detection[row]} (score {table.camera_score[row]:.2f})")
+        overlap = "" if np.isnan(table.iou[row]) else f", image IoU {table.iou[row]:.2f}"
+        label = self.detections.class_names[self.detections.labels[output]]
+        stage = Stage(table.stage[row]).name.lower()
+        return f"{label} {self.detections.scores[output]:.2f}, {stage}: {reason}; from {' and '.join(parts)}{overlap}"
+
+    def _origin(self, output: int) -> tuple[Decisions, int]:
+        """The table and row that led to an output: the LiDAR row where there is one."""
+        for table in (self.lidar, self.camera):
+            rows = np.flatnonzero(table.output == output)
+            if len(rows):
+                return table, int(rows[0])
+        raise IndexError(f"no output {output}: there are {len(self.detections)}")
+
+    def to_json(self) -> dict[str, Any]:
+        """Provenance as plain JSON values; read back with `from_json`."""
+        return {
+            "cameras": list(self.camera_names),
+            "notes": list(self.notes),
+            "detections": _detections_to_json(self.detections),
+            "lidar_inputs": _detections_to_json(self.lidar_inputs),
+            "camera_inputs": [_detections_to_json(d) for d in self.camera_inputs],
+            "lidar": [self.lidar.row(i) for i in range(len(self.lidar))],
+            "camera": [self.camera.row(i) for i in range(len(self.camera))],
+        }
+
+    @classmethod
+    def from_json(cls, value: dict[str, Any]) -> FusedDetections:
+        """The inverse of `to_json`; instance masks, velocities and attributes of the inputs are not kept."""
+        return cls(
+            detections=Detections3D(**_detections_from_json(value["detections"])),
+            lidar=Decisions.from_rows(value["lidar"]),
+            camera=Decisions.from_rows(value["camera"]),
+            lidar_inputs=Detections3D(**_detections_from_json(value["lidar_inputs"])),
+            camera_inputs=tuple(Detections2D(**_detections_from_json(d)) for d in value["camera_inputs"]),
+            camera_names=tuple(value["cameras"]),
+            notes=tuple(value["notes"]),
+        )
+
+
+def _detections_to_json(detections: Detections2D | Detections3D) -> dict[str, Any]:
+    # five decimals are a hundredth of a millimetre, and a third of the size
+    return {
+        "boxes": np.round(detections.boxes, 5).tolist(),
+        "scores": np.round(detections.scores, 7).tolist(),
+        "labels": detections.labels.tolist(),
+        "class_names": list(detections.class_names),
+    }
+
+
+def _detections_from_json(value: dict[str, Any]) -> dict[str, Any]:
+    return {**value, "class_names": tuple(value["class_names"])}
