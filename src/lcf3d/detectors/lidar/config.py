@@ -1,0 +1,173 @@
+"""What a LiDAR network needs to know beside its weights: ranges, voxels, anchors, thresholds."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, fields
+from typing import Any
+
+from lcf3d.errors import ConfigError
+
+CHANNELS = ("x", "y", "z", "intensity", "time")
+
+
+@dataclass(frozen=True)
+class VoxelSpec:
+    """How points are put into voxels.
+
+    Attributes:
+        size: voxel edge along x, y, z in metres.
+        area: ``(x, y, z)`` lower, then upper corner of the voxelised volume, in metres.
+        max_points: points of one voxel beyond this number are dropped, in input order.
+        max_voxels: voxels beyond this number are dropped, in order of their first point.
+    """
+
+    size: tuple[float, float, float]
+    area: tuple[float, float, float, float, float, float]
+    max_points: int
+    max_voxels: int
+
+    @property
+    def grid(self) -> tuple[int, int, int]:
+        """Number of voxels along x, y, z."""
+        nx, ny, nz = (round((self.area[i + 3] - self.area[i]) / self.size[i]) for i in range(3))
+        return nx, ny, nz
+
+
+@dataclass(frozen=True)
+class AnchorLevel:
+    """Anchors of one output map: a size and a bottom height each, every size at every rotation.
+
+    Attributes:
+        sizes: ``(length, width, height)`` in metres.
+        bottoms: z of the bottom face of each size, in metres.
+    """
+
+    sizes: tuple[tuple[float, float, float], ...]
+    bottoms: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class AnchorSpec:
+    """Anchor boxes and the direction classifier of an anchor head.
+
+    Attributes:
+        levels: one for each output map of the head.
+        area: ``(x, y)`` lower, then upper corner that the anchors cover, in metres.
+        aligned: anchors stand on cell centres; otherwise the first and last stand on the border of ``area``.
+        direction_offset: heading at which the direction classifier's two half turns meet.
+        code_size: 7 box parameters, or 9 with velocity.
+        joint: the best candidates are chosen over all maps together; otherwise for each map.
+        rotations: anchor headings in radians.
+    """
+
+    levels: tuple[AnchorLevel, ...]
+    area: tuple[float, float, float, float]
+    aligned: bool
+    direction_offset: float
+    code_size: int = 7
+    joint: bool = False
+    rotations: tuple[float, ...] = (0.0, 1.57)
+
+
+@dataclass(frozen=True)
+class CenterSpec:
+    """Tasks and decoding of a centre head.
+
+    Attributes:
+        tasks: class names of each task; their concatenation is the class list.
+        stride: voxels to one cell of the heat map.
+        limits: ``(x, y, z)`` lower, then upper corner that kept centres lie in, in metres.
+        max_per_task: boxes kept of each task after suppression.
+        max_candidates: heat-map peaks taken of each task.
+    """
+
+    tasks: tuple[tuple[str, ...], ...]
+    stride: int
+    limits: tuple[float, float, float, float, float, float] = (-61.2, -61.2, -10.0, 61.2, 61.2, 10.0)
+    max_per_task: int = 83
+    max_candidates: int = 500
+
+
+@dataclass(frozen=True)
+class Suppression:
+    """The model's own last step: score threshold and rotated bird's-eye-view NMS.
+
+    Attributes:
+        score_threshold: boxes need a higher score.
+        iou_threshold: of two boxes with a higher overlap, the one with the lower score goes.
+        candidates: best boxes that enter (of each output map, or of all, see `AnchorSpec.joint`).
+        max_boxes: boxes returned at most.
+    """
+
+    score_threshold: float
+    iou_threshold: float
+    candidates: int
+    max_boxes: int
+
+
+@dataclass(frozen=True)
+class LidarConfig:
+    """A LiDAR network's configuration.
+
+    Attributes:
+        name: name of the preset.
+        architecture: which detector class builds it.
+        class_names: the classes its scores stand for, in order.
+        channels: point columns the network takes, of `CHANNELS`.
+        voxels: voxelization.
+        suppression: the final step.
+        anchors: for detectors with anchors.
+        centers: for CenterPoint.
+        proposals: first stage of two-stage detectors.
+        variant: which of the architecture's networks, for example the backbone of SSN.
+        offsets_replace_position: see `lcf3d.detectors.lidar.voxelization.decorate`.
+    """
+
+    name: str
+    architecture: str
+    class_names: tuple[str, ...]
+    channels: tuple[str, ...]
+    voxels: VoxelSpec
+    suppression: Suppression
+    anchors: AnchorSpec | None = None
+    centers: CenterSpec | None = None
+    proposals: Suppression | None = None
+    variant: str = ""
+    offsets_replace_position: bool = False
+
+    @property
+    def has_velocity(self) -> bool:
+        """Whether the network predicts velocities."""
+        return self.centers is not None or (self.anchors is not None and self.anchors.code_size == 9)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The configuration as plain values, for JSON."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, value: dict[str, Any]) -> LidarConfig:
+        """The configuration that `to_dict` wrote.
+
+        Raises:
+            ConfigError: ``value`` is not such a dictionary.
+        """
+        try:
+            values = {field.name: _tuples(value[field.name]) for field in fields(cls)}
+            values["voxels"] = VoxelSpec(**values["voxels"])
+            for name, kind in (("suppression", Suppression), ("proposals", Suppression), ("centers", CenterSpec)):
+                values[name] = None if values[name] is None else kind(**values[name])
+            if values["anchors"] is not None:
+                levels = tuple(AnchorLevel(**level) for level in values["anchors"]["levels"])
+                values["anchors"] = AnchorSpec(**{**values["anchors"], "levels": levels})
+            return cls(**values)
+        except (KeyError, TypeError) as error:
+            raise ConfigError(f"not a LiDAR network configuration of lcf3d: {error}") from None
+
+
+def _tuples(value: Any) -> Any:
+    """``value`` with every list, at any depth, turned into a tuple."""
+    if isinstance(value, (list, tuple)):
+        return tuple(_tuples(item) for item in value)
+    if isinstance(value, dict):
+        return {key: _tuples(item) for key, item in value.items()}
+    return value

@@ -1,0 +1,150 @@
+"""The base of the LiDAR detectors in torch: a network, its configuration, and how boxes are thresholded."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from typing_extensions import Self
+
+from lcf3d.detectors.lidar._torch import Tensor, nn, torch
+from lcf3d.detectors.lidar.config import LidarConfig
+from lcf3d.detectors.lidar.fusing import fuse_batch_norm
+from lcf3d.detectors.lidar.inputs import Inputs, map_detections, pillar_inputs
+from lcf3d.detectors.lidar.suppression import NmsMode, suppression_threshold
+from lcf3d.errors import ConfigError
+from lcf3d.structures import Detections3D
+
+
+class TorchLidarDetector(ABC):
+    """A LiDAR detector: ``detector(points) -> Detections3D``.
+
+    Args:
+        network: built by `build` and filled with weights; it is put into evaluation mode.
+        config: its configuration.
+        nms: ``off`` (the paper's choice), ``low`` (only near-copies go) or ``keep`` (the network's own suppression).
+        score_threshold: boxes need a higher score; the configuration's own without one.
+        device: a torch device, for example ``cpu`` or ``cuda``.
+
+    Raises:
+        ConfigError: ``nms`` or ``score_threshold`` makes no sense.
+    """
+
+    architecture: ClassVar[str]
+
+    def __init__(
+        self,
+        network: nn.Module,
+        config: LidarConfig,
+        nms: NmsMode = "keep",
+        score_threshold: float | None = None,
+        device: str = "cpu",
+    ) -> None:
+        suppression_threshold(nms, 0.0)
+        if score_threshold is not None and not 0 <= score_threshold < 1:
+            raise ConfigError(f"score_threshold must be in [0, 1), got {score_threshold}")
+        self.config = config
+        self.nms = nms
+        self.score_threshold = config.suppression.score_threshold if score_threshold is None else score_threshold
+        self.device = torch.device(device)
+        self.network = network.eval().requires_grad_(False).to(self.device)
+
+    @classmethod
+    def build(cls, config: LidarConfig) -> nn.Module:
+        """The network of ``config``, with untrained weights."""
+        raise NotImplementedError
+
+    @classmethod
+    def from_state_dict(cls, state: Mapping[str, Any], config: LidarConfig, **options: Any) -> Self:
+        """A detector with the given weights, named as in the published checkpoints.
+
+        Args:
+            state: parameter name -> tensor.
+            config: the configuration that the weights were trained with.
+            options: see the class.
+
+        Raises:
+            DetectorError: names or shapes differ from the network's.
+        """
+        from lcf3d.detectors.checkpoints import load_parameters
+
+        with torch.device("meta"):
+            network = cls.build(config)
+        load_parameters(network, state, config.name)
+        return cls(fuse_batch_norm(network.eval()), config, **options)
+
+    @classmethod
+    def from_checkpoint(cls, path: Path | str, preset: str | None = None, **options: Any) -> Self:
+        """A detector from a checkpoint file of OpenMMLab or OpenPCDet; no code in it is executed.
+
+        Args:
+            path: the file.
+            preset: name of a configuration; found from the names and shapes of the parameters without it.
+            options: see the class.
+
+        Raises:
+            DetectorError: the file is damaged, or holds another network or number of classes.
+        """
+        from lcf3d.detectors.checkpoints import read_lidar_checkpoint
+
+        state, config = read_lidar_checkpoint(Path(path), preset, cls.architecture)
+        return cls.from_state_dict(state, config, **options)
+
+    @property
+    def class_names(self) -> tuple[str, ...]:
+        """The classes that labels index."""
+        return self.config.class_names
+
+    def __call__(self, points: NDArray[np.floating]) -> Detections3D:
+        """Detections in a point cloud.
+
+        Args:
+            points: (N, 4 or more) ``x, y, z, intensity[, time lag in seconds]`` in the LiDAR frame. Points that are
+                not finite or out of range are left out; without any left there are no detections.
+
+        Raises:
+            ShapeError: too few columns.
+        """
+        inputs = self.inputs(points)
+        if inputs is None:
+            empty = Detections3D.empty(self.class_names)
+            return Detections3D(**{**vars(empty), "velocities": np.zeros((0, 2))}) if self.config.has_velocity else empty
+        with torch.inference_mode():
+            return self.detect({name: torch.from_numpy(value).to(self.device) for name, value in inputs.items()})
+
+    @abstractmethod
+    def inputs(self, points: NDArray[np.floating]) -> Inputs | None:
+        """The network's input arrays, or None when no point lies in its range."""
+
+    @abstractmethod
+    def detect(self, inputs: dict[str, Tensor]) -> Detections3D:
+        """Detections from input tensors on the detector's device."""
+
+
+class OneStageDetector(TorchLidarDetector):
+    """A detector whose head's maps are decoded to the final boxes."""
+
+    def detect(self, inputs: dict[str, Tensor]) -> Detections3D:
+        """Detections from input tensors on the detector's device."""
+        return map_detections(to_arrays(self.network(**inputs)), self.config, self.score_threshold, self.nms)
+
+
+class PillarDetector(OneStageDetector):
+    """A one-stage detector on pillars."""
+
+    def inputs(self, points: NDArray[np.floating]) -> Inputs | None:
+        """See `pillar_inputs`."""
+        return pillar_inputs(points, self.config)
+
+
+def to_arrays(maps: Any) -> Any:
+    """Tensors at any depth of lists, tuples and dictionaries as arrays without their batch axis."""
+    if isinstance(maps, Tensor):
+        return maps[0].cpu().numpy()
+    if isinstance(maps, dict):
+        return {name: to_arrays(value) for name, value in maps.items()}
+    return type(maps)(to_arrays(value) for value in maps)
