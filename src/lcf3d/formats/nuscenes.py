@@ -1,0 +1,177 @@
+"""nuScenes submission files: ``{"meta": {...}, "results": {sample_token: [box, ...]}}``, boxes in the global frame."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lcf3d.errors import FormatError
+from lcf3d.formats.files import write_text
+from lcf3d.formats.json_stream import JsonCursor
+from lcf3d.formats.nuscenes_boxes import NUSCENES_ATTRIBUTES, GlobalBoxes
+from lcf3d.structures import NUSCENES_CLASSES
+
+MAX_BOXES_PER_SAMPLE = 500
+"""The most boxes that the nuScenes benchmark accepts for one sample."""
+
+_META = {"use_camera": True, "use_lidar": True, "use_radar": False, "use_map": False, "use_external": False}
+_NUMBERS: dict[str, tuple[int, ...]] = {
+    "translation": (3,),
+    "size": (3,),
+    "rotation": (4,),
+    "velocity": (2,),
+    "detection_score": (),
+}
+_UNKNOWN = -2
+_NAMES = {
+    "detection_name": {name: i for i, name in enumerate(NUSCENES_CLASSES)},
+    "attribute_name": {name: i for i, name in enumerate(NUSCENES_ATTRIBUTES)} | {"": -1},
+}
+
+
+def read_submission(path: Path, max_boxes: int = MAX_BOXES_PER_SAMPLE) -> tuple[GlobalBoxes, dict[str, Any]]:
+    """Boxes and ``meta`` of a submission file, in file order.
+
+    Raises:
+        FormatError: not a submission; a sample token that occurs twice or holds more than ``max_boxes`` boxes; a box
+            with a missing key, an unknown class or attribute, a score or coordinate that is not a finite number, or a
+            size that is not positive. The message names the file and the sample.
+    """
+    try:
+        cursor = JsonCursor(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise FormatError(f"{path} does not exist") from None
+    except UnicodeDecodeError:
+        raise FormatError(f"{path} is not a text file in UTF-8") from None
+    tokens: list[str] = []
+    parts: list[dict[str, Any]] = []
+    meta: dict[str, Any] | None = None
+    found = False
+    try:
+        for key in cursor.members():
+            if key == "results":
+                found = True
+                for token in cursor.members():
+                    tokens.append(token)
+                    parts.append(_read_sample(path, token, cursor.value(), max_boxes))
+            elif key == "meta":
+                meta = cursor.value()
+            else:
+                cursor.value()
+    except json.JSONDecodeError as error:
+        raise FormatError(f"{path}:{error.lineno}:{error.colno}: not a nuScenes submission ({error.msg})") from None
+    if not found:
+        raise FormatError(f"{path} has no 'results'; a nuScenes submission is {{'meta': ..., 'results': ...}}")
+    repeated = [token for token, times in Counter(tokens).items() if times > 1]
+    if repeated:
+        raise FormatError(f"{path}: sample token {repeated[0]} occurs twice (as do {len(repeated) - 1} more)")
+    return _join(path, tokens, parts), meta or {}
+
+
+def write_submission(path: Path, boxes: GlobalBoxes, meta: Mapping[str, Any] | None = None) -> None:
+    """Write ``boxes`` as a submission file: every sample token, the highest scores first, at most 500 a sample.
+
+    Velocities that are unknown are written as 0, the only value the format has for them. ``meta`` says which inputs
+    were used (default: camera and LiDAR).
+
+    Raises:
+        FormatError: a coordinate, size or score is not a finite number.
+    """
+    for name in ("translations", "sizes", "rotations", "scores"):
+        bad = ~np.isfinite(getattr(boxes, name).reshape(len(boxes), -1)).all(axis=1)
+        if bad.any():
+            token = boxes.sample_tokens[boxes.samples[np.flatnonzero(bad)[0]]]
+            raise FormatError(f"cannot write {path}: {name} of a box of sample {token} hold NaN or infinite values")
+    results: dict[str, list[dict[str, Any]]] = {token: [] for token in boxes.sample_tokens}
+    velocities = np.nan_to_num(boxes.velocities)
+    for i in np.lexsort((-boxes.scores, boxes.samples)):
+        token = boxes.sample_tokens[boxes.samples[i]]
+        if len(results[token]) == MAX_BOXES_PER_SAMPLE:
+            continue
+        results[token].append(
+            {
+                "sample_token": token,
+                "translation": boxes.translations[i].tolist(),
+                "size": boxes.sizes[i].tolist(),
+                "rotation": boxes.rotations[i].tolist(),
+                "velocity": velocities[i].tolist(),
+                "detection_name": NUSCENES_CLASSES[boxes.labels[i]],
+                "detection_score": float(boxes.scores[i]),
+                "attribute_name": "" if boxes.attributes[i] < 0 else NUSCENES_ATTRIBUTES[boxes.attributes[i]],
+            }
+        )
+    write_text(path, json.dumps({"meta": dict(_META if meta is None else meta), "results": results}) + "\n")
+
+
+def _read_sample(path: Path, token: str, boxes: Any, max_boxes: int) -> dict[str, Any]:
+    """Arrays by key of one sample's boxes; attributes and classes as indices."""
+    if not isinstance(boxes, list) or not all(isinstance(box, dict) for box in boxes):
+        raise FormatError(f"{path}: sample {token} must hold a list of boxes")
+    if len(boxes) > max_boxes:
+        raise FormatError(
+            f"{path}: sample {token} holds {len(boxes)} boxes, at most {max_boxes} are allowed; "
+            "keep those of the highest scores"
+        )
+    arrays: dict[str, Any] = {}
+    try:
+        for key, shape in _NUMBERS.items():
+            try:
+                array = np.array([box[key] for box in boxes], dtype=np.float64)
+            except (TypeError, ValueError):
+                array = np.empty(())
+            if array.shape != (len(boxes), *shape) and boxes:
+                expected = f"{shape[0]} numbers" if shape else "a number"
+                raise FormatError(f"{path}: {key} of a box of sample {token} must be {expected}")
+            arrays[key] = array.reshape(len(boxes), *shape)
+        for key, index in _NAMES.items():
+            arrays[key] = np.array([index.get(box[key], _UNKNOWN) for box in boxes], dtype=np.int64)
+            if (arrays[key] == _UNKNOWN).any():
+                name = boxes[int(np.argmax(arrays[key] == _UNKNOWN))][key]
+                known = ", ".join(filter(None, index))
+                raise FormatError(f"{path}: sample {token} holds a box of unknown {key} {name!r}; known are {known}")
+    except KeyError as error:
+        raise FormatError(f"{path}: a box of sample {token} has no {error.args[0]!r}") from None
+    if any(box.get("sample_token", token) != token for box in boxes):
+        raise FormatError(f"{path}: a box listed under sample {token} carries another sample's token")
+    return arrays
+
+
+def _join(path: Path, tokens: list[str], parts: list[dict[str, Any]]) -> GlobalBoxes:
+    """The samples' arrays joined, with their values checked."""
+    samples = np.repeat(np.arange(len(parts)), [len(part["detection_score"]) for part in parts])
+    joined: dict[str, Any] = {
+        key: np.concatenate([part[key] for part in parts] + [np.zeros((0, *shape))]) for key, shape in _NUMBERS.items()
+    }
+    # a velocity may be unknown (NaN); nothing else may
+    checks = [
+        (f"{key} that is NaN or infinite", ~np.isfinite(joined[key].reshape(len(samples), -1)).all(axis=1))
+        for key in _NUMBERS
+        if key != "velocity"
+    ]
+    checks.append(("size that is not positive", (joined["size"] <= 0).any(axis=1)))
+    checks.append(("rotation that is zero", (joined["rotation"] == 0).all(axis=1)))
+    for what, bad in checks:
+        if bad.any():
+            token = tokens[samples[np.argmax(bad)]]
+            raise FormatError(f"{path}: {int(bad.sum())} boxes, the first of sample {token}, have a {what}")
+    labels, attributes = (
+        np.concatenate([part[key] for part in parts] + [np.zeros(0, np.int64)])
+        for key in ("detection_name", "attribute_name")
+    )
+    return GlobalBoxes(
+        tuple(tokens),
+        samples.astype(np.int64),
+        joined["translation"],
+        joined["size"],
+        joined["rotation"],
+        joined["velocity"],
+        labels,
+        joined["detection_score"],
+        attributes,
+        np.full(len(samples), -1, dtype=np.int64),
+    )
