@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from typing import Literal, NamedTuple
+from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numba import njit
@@ -18,7 +19,8 @@ _CODES = {"cliques": 0, "components": 1, "nms": 2}
 SUPPRESSED = -1
 
 
-class Clusters(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Clusters:
     """A partition of boxes.
 
     Attributes:

@@ -25,36 +25,44 @@ class FusionConfig(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    class_names: tuple[str, ...] = Field(KITTI_CLASSES, min_length=1, description="classes to detect")
-    camera_score_threshold: Fraction = Field(0.5, description="2D detections not above it are left out")
-    lidar_score_threshold: Fraction = Field(0.1, description="3D detections not above it are left out")
-    max_boxes: int = Field(1000, ge=1, description="only so many 3D boxes of highest score a frame take part")
+    class_names: tuple[str, ...] = Field(default=KITTI_CLASSES, min_length=1, description="classes to detect")
+    camera_score_threshold: Fraction = Field(default=0.5, description="2D detections not above it are left out")
+    lidar_score_threshold: Fraction = Field(default=0.1, description="3D detections not above it are left out")
+    max_boxes: int = Field(default=1000, ge=1, description="only so many 3D boxes of highest score a frame take part")
 
-    clustering: Literal["cliques", "components", "nms"] = Field("cliques", description="how 3D boxes are grouped")
-    cluster_iou: Fraction = Field(0.3, description="tau_z: BEV IoU that links two boxes")
-    class_aware: bool = Field(False, description="link boxes of equal class only")
+    clustering: Literal["cliques", "components", "nms"] = Field(
+        default="cliques", description="how 3D boxes are grouped"
+    )
+    cluster_iou: Fraction = Field(default=0.3, description="tau_z: BEV IoU that links two boxes")
+    class_aware: bool = Field(default=False, description="link boxes of equal class only")
 
-    assignment: Literal["gated", "paper"] = Field("gated", description="drop poor pairs before or after assigning")
-    match_iou: Fraction = Field(0.4, description="tau_b: image IoU of a match")
+    assignment: Literal["gated", "paper"] = Field(
+        default="gated", description="drop poor pairs before or after assigning"
+    )
+    match_iou: Fraction = Field(default=0.4, description="tau_b: image IoU of a match")
     representative: Literal["highest_score", "camera_class"] = Field(
-        "highest_score", description="which member stands for a matched cluster"
+        default="highest_score", description="which member stands for a matched cluster"
     )
     unmatched: Literal["drop", "downweight", "keep"] = Field(
-        "drop", description="clusters in view that no camera confirms"
+        default="drop", description="clusters in view that no camera confirms"
     )
     miss_likelihood: Fraction = Field(
-        0.2, description="downweight: the score a camera silently gives what it does not detect"
+        default=0.2, description="downweight: the score a camera silently gives what it does not detect"
     )
-    out_of_view: Literal["keep", "drop"] = Field("keep", description="clusters that no used camera looks at")
+    out_of_view: Literal["keep", "drop"] = Field(default="keep", description="clusters that no used camera looks at")
 
-    recovery: bool = Field(True, description="lift unmatched 2D detections into frustums")
-    enlargement: Annotated[float, Field(ge=0)] = Field(0.05, description="e: growth of 2D boxes before lifting")
-    min_points: int = Field(10, ge=1, description="p_min: fewest points of a frustum")
-    mask_mode: Literal["box", "mask", "box+mask"] = Field("box", description="how instance masks are used")
-    confirm_iou: Fraction = Field(0.3, description="tau_d: image IoU that confirms a recovered box")
-    duplicate_iou: Fraction = Field(0.1, description="BEV IoU with a confirmed box that makes a recovered one a double")
+    recovery: bool = Field(default=True, description="lift unmatched 2D detections into frustums")
+    enlargement: Annotated[float, Field(ge=0)] = Field(default=0.05, description="e: growth of 2D boxes before lifting")
+    min_points: int = Field(default=10, ge=1, description="p_min: fewest points of a frustum")
+    mask_mode: Literal["box", "mask", "box+mask"] = Field(default="box", description="how instance masks are used")
+    confirm_iou: Fraction = Field(default=0.3, description="tau_d: image IoU that confirms a recovered box")
+    duplicate_iou: Fraction = Field(
+        default=0.1, description="BEV IoU with a confirmed box that makes a recovered one a double"
+    )
 
-    ensemble: Literal["probabilistic", "product"] = Field("probabilistic", description="how agreeing scores are fused")
+    ensemble: Literal["probabilistic", "product"] = Field(
+        default="probabilistic", description="how agreeing scores are fused"
+    )
     priors: dict[str, Annotated[float, Field(gt=0, lt=1)]] = Field(
         default_factory=dict, description="prior by class; classes left out are uniform"
     )

@@ -147,7 +147,8 @@ def gaussian_mask(pixels: FloatArray, box: FloatArray) -> NDArray[np.float32]:
     centre = (box[:2] + box[2:]) / 2
     sides = np.maximum(box[2:] - box[:2], 1e-6)
     exponent = ((pixels - centre) / sides) ** 2
-    return np.exp(-0.5 * exponent.sum(axis=1)).astype(np.float32)
+    mask: NDArray[np.float32] = np.exp(-0.5 * exponent.sum(axis=1)).astype(np.float32)
+    return mask
 
 
 def axis_yaws(boxes: FloatArray, camera: Camera) -> FloatArray:
@@ -180,7 +181,7 @@ def extract_frustums(
         mask_mode: ``box`` takes all points in the box; ``mask`` only those on the instance mask, or the box where the
             mask keeps fewer than ``min_points``; ``box+mask`` takes the box and marks the points on the mask.
     """
-    parts: list[tuple[FloatArray, NDArray[np.float32], NDArray[np.float32]]] = []
+    parts: list[tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]] = []
     rows: list[tuple[int, int, float]] = []
     for c, (camera, found, chosen) in enumerate(zip(cameras, detections, selected, strict=True)):
         if not len(chosen):
@@ -218,7 +219,7 @@ def _assemble(
     points: NDArray[np.float32],
     cameras: Sequence[Camera],
     detections: Sequence[Detections2D],
-    parts: list[tuple[FloatArray, NDArray[np.float32], NDArray[np.float32]]],
+    parts: list[tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]],
     rows: list[tuple[int, int, float]],
     mask_mode: MaskMode,
 ) -> FrustumProposals:

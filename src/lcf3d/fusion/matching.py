@@ -141,5 +141,4 @@ def confirmed_elsewhere(
     """
     others = (matches.camera >= 0) & (views[at].match < 0)
     shown = image_iou(views[at].boxes[clusters.representative[others]], boxes2d)
-    result: BoolArray = (shown > iou_threshold).any(axis=0)
-    return result
+    return np.asarray((shown > iou_threshold).any(axis=0))

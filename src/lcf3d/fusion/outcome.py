@@ -44,7 +44,7 @@ def decide_clusters(branches: Branches, clusters: Clusters, matches: Matches, co
     box = clusters.representative.copy()
     if config.representative == "camera_class":
         box[matched] = [
-            _best_of_class(lidar, clusters, c, label) for c, label in zip(matched, camera_labels, strict=True)
+            _best_of_class(lidar, clusters, int(c), int(label)) for c, label in zip(matched, camera_labels, strict=True)
         ]
     scores, labels = lidar.scores[box], lidar.labels[box]
     stage = np.full(len(box), Stage.KEPT, dtype=np.int64)

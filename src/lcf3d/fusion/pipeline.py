@@ -135,7 +135,8 @@ class LateCascadeFusion:
         lasting = (outcome.stage == Stage.MATCHED) | (
             (outcome.stage == Stage.KEPT) & (outcome.reason == Reason.OUT_OF_VIEW)
         )
-        return branches.lidar.boxes[outcome.box[lasting]]
+        boxes: FloatArray = branches.lidar.boxes[outcome.box[lasting]]
+        return boxes
 
     @staticmethod
     def _mark(branches: Branches, camera: int, detections: IntArray, reason: Reason) -> None:

@@ -146,7 +146,7 @@ def confirmation_iou(proposals: FrustumProposals, boxes: FloatArray) -> FloatArr
 def _mark_duplicates(table: Recovery, confirmed: FloatArray, duplicate_iou: float) -> None:
     """Turn ``LOCALIZED`` into ``DUPLICATE`` where a box overlaps a confirmed or a better recovered one."""
     rows = table.found[np.argsort(-table.scores[table.found], kind="stable")]
-    with_confirmed = (bev_iou(table.boxes[rows], confirmed) > duplicate_iou).any(axis=1)
+    with_confirmed = np.asarray((bev_iou(table.boxes[rows], confirmed) > duplicate_iou).any(axis=1))
     among = bev_iou(table.boxes[rows], table.boxes[rows]) > duplicate_iou
     kept: list[int] = []
     for i in range(len(rows)):

@@ -134,7 +134,7 @@ def mmdet3d_from_canonical(boxes: FloatArray) -> FloatArray:
 
 
 def canonical_from_legacy_mmdet3d(boxes: FloatArray) -> FloatArray:
-    """Canonical boxes from OpenMMLab boxes before v1.0 (as in SECOND): ``x y z w l h``, bottom, yaw from -y, clockwise."""
+    """Canonical boxes from OpenMMLab boxes before v1.0: ``x y z w l h``, bottom face, yaw clockwise from -y."""
     result = np.array(boxes[:, [0, 1, 2, 4, 3, 5, 6]], dtype=np.float64)
     result[:, Z] += result[:, HEIGHT] / 2
     result[:, YAW] = wrap_angle(-result[:, YAW] - np.pi / 2)

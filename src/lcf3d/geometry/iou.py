@@ -22,13 +22,15 @@ def image_iou(boxes_a: FloatArray, boxes_b: FloatArray) -> FloatArray:
     sides = np.maximum(bottom_right - top_left, 0)
     intersection = sides[..., 0] * sides[..., 1]
     union = image_area(boxes_a)[:, None] + image_area(boxes_b)[None] - intersection
-    return np.divide(intersection, union, out=np.zeros_like(intersection), where=union > 0)
+    iou: FloatArray = np.divide(intersection, union, out=np.zeros_like(intersection), where=union > 0)
+    return iou
 
 
 def image_area(boxes: FloatArray) -> FloatArray:
     """(N,) areas of (N, 4) pixel boxes; reversed boxes have none."""
-    sides: FloatArray = np.maximum(boxes[:, 2:] - boxes[:, :2], 0)
-    return sides[:, 0] * sides[:, 1]
+    sides = np.maximum(boxes[:, 2:] - boxes[:, :2], 0)
+    area: FloatArray = sides[:, 0] * sides[:, 1]
+    return area
 
 
 @njit(cache=True, nogil=True, inline="always")

@@ -1,0 +1,275 @@
+"""KITTI object layout: ``ROOT/training/{calib,image_2,image_3,velodyne,label_2}`` and ``ROOT/ImageSets/SPLIT.txt``.
+
+Any subset of the sensor folders may be there. Camera ``left`` is the left colour camera (``image_2``, ``P2``) and
+``right`` the right one (``image_3``, ``P3``). The LiDAR frame is the Velodyne's: x forward, y left, z up already.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lcf3d.errors import DatasetError, FormatError
+from lcf3d.formats.kitti import detections_3d, read_frame_ids, read_objects
+from lcf3d.structures import KITTI_CLASSES, Camera, Detections3D, FloatArray, Frame
+
+# (camera name, image folder, projection in the calibration file)
+CAMERAS = (("left", "image_2", "P2"), ("right", "image_3", "P3"))
+# (width, height) of the rectified images of each recording day, known by the focal length that its calibration gave
+IMAGE_SIZES = {
+    721.5377: (1242, 375),
+    707.0493: (1224, 370),
+    718.3351: (1238, 374),
+    707.0912: (1226, 370),
+    718.856: (1241, 376),
+}
+DEFAULT_IMAGE_SIZE = (1242, 375)
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
+
+
+@dataclass(frozen=True, eq=False)
+class KittiCalibration:
+    """What a KITTI calibration file says.
+
+    Attributes:
+        projections: (3, 4) by name ``P0`` to ``P3``, pixels from the rectified reference camera.
+        camera_from_lidar: (4, 4) rectified reference camera from Velodyne, ``R0_rect @ Tr_velo_to_cam``.
+    """
+
+    projections: Mapping[str, FloatArray]
+    camera_from_lidar: FloatArray
+
+
+def read_calibration(path: Path) -> KittiCalibration:
+    """Read a calibration file; spellings of the object and of the tracking benchmark are understood.
+
+    Raises:
+        DatasetError: the file does not exist.
+        FormatError: an entry is missing or malformed; names it.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise DatasetError(f"calibration file {path} does not exist") from None
+    except UnicodeDecodeError:
+        raise FormatError(f"{path} is not a text file in UTF-8") from None
+    entries: dict[str, FloatArray] = {}
+    for number, line in enumerate(text.splitlines(), 1):
+        name, *fields = line.replace(":", " ").split() or [""]
+        try:
+            entries[name] = np.array([float(f) for f in fields])
+        except ValueError:
+            raise FormatError(f"{path}:{number}: {name} must be followed by numbers") from None
+        if not np.isfinite(entries[name]).all():
+            raise FormatError(f"{path}:{number}: {name} holds NaN or infinite values")
+    rectification = np.eye(4)
+    rectification[:3, :3] = _matrix(path, entries, ("R0_rect", "R_rect"), (3, 3))
+    reference_from_lidar = np.eye(4)
+    reference_from_lidar[:3] = _matrix(path, entries, ("Tr_velo_to_cam", "Tr_velo_cam"), (3, 4))
+    projections = {
+        name: _matrix(path, entries, (name,), (3, 4)) for name in ("P0", "P1", "P2", "P3") if name in entries
+    }
+    if "P2" not in projections:
+        raise FormatError(f"{path} has no entry P2")
+    return KittiCalibration(projections, rectification @ reference_from_lidar)
+
+
+def _matrix(path: Path, entries: Mapping[str, FloatArray], names: Sequence[str], shape: tuple[int, int]) -> FloatArray:
+    for name in names:
+        if name in entries:
+            if entries[name].size != shape[0] * shape[1]:
+                raise FormatError(f"{path}: {name} must hold {shape[0] * shape[1]} numbers, got {entries[name].size}")
+            return entries[name].reshape(shape)
+    raise FormatError(f"{path} has no entry {' or '.join(names)}")
+
+
+def read_points(path: Path) -> NDArray[np.float32]:
+    """(N, 4) float32 ``x, y, z, reflectance`` of a ``.bin`` scan.
+
+    Raises:
+        DatasetError: the file does not exist.
+        FormatError: it is cut off, or holds NaN or infinite values.
+    """
+    try:
+        raw = path.read_bytes()
+    except FileNotFoundError:
+        raise DatasetError(f"scan {path} does not exist") from None
+    if len(raw) % 16:
+        raise FormatError(f"{path} is cut off: {len(raw)} bytes are no whole number of 16-byte points; copy it again")
+    points = np.frombuffer(raw, dtype="<f4").reshape(-1, 4).astype(np.float32)
+    bad = int((~np.isfinite(points).all(axis=1)).sum())
+    if bad:
+        raise FormatError(f"{path} holds {bad} points with NaN or infinite values; remove them first")
+    return points
+
+
+def read_image(path: Path, size: tuple[int, int] | None = None) -> NDArray[np.uint8]:
+    """(H, W, 3) uint8 RGB image.
+
+    Args:
+        path: any format that Pillow reads.
+        size: expected (width, height), or None.
+
+    Raises:
+        DatasetError: the file does not exist.
+        FormatError: it is no image, or not of the expected size.
+    """
+    from PIL import Image, UnidentifiedImageError
+
+    try:
+        with Image.open(path) as image:
+            pixels = np.asarray(image.convert("RGB"))
+    except FileNotFoundError:
+        raise DatasetError(f"image {path} does not exist") from None
+    except (UnidentifiedImageError, OSError) as error:
+        raise FormatError(f"{path} cannot be read as an image ({error})") from None
+    if size is not None and pixels.shape[1::-1] != size:
+        width, height = pixels.shape[1::-1]
+        raise FormatError(f"{path} is {width} x {height} pixels, but its camera is {size[0]} x {size[1]}")
+    return pixels
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """(width, height) in pixels, from the file's header alone.
+
+    Raises:
+        FormatError: it is no image.
+    """
+    from PIL import Image, UnidentifiedImageError
+
+    try:
+        with Image.open(path) as image:
+            return image.size
+    except (UnidentifiedImageError, OSError) as error:
+        raise FormatError(f"{path} cannot be read as an image ({error})") from None
+
+
+def _check_image_size(path: Path, size: tuple[int, int], projection: FloatArray) -> None:
+    """Refuse an image that was resized without its calibration: the principal point leaves the middle of the image."""
+    for length, centre, name in zip(size, projection[:2, 2], ("width", "height"), strict=True):
+        if not 0.25 < centre / length < 0.75:
+            raise FormatError(
+                f"{path} is {size[0]} x {size[1]} pixels, but its calibration puts the image centre at "
+                f"({projection[0, 2]:.0f}, {projection[1, 2]:.0f}): wrong {name}; use the original image"
+            )
+
+
+class _Images(Mapping[str, NDArray[np.uint8]]):
+    """Images of one frame by camera name, read when asked for."""
+
+    def __init__(self, paths: Mapping[str, Path]) -> None:
+        self._paths = paths
+
+    def __getitem__(self, name: str) -> NDArray[np.uint8]:
+        return read_image(self._paths[name])
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._paths)
+
+    def __len__(self) -> int:
+        return len(self._paths)
+
+
+class KittiDataset(Sequence[Frame]):
+    """Frames of a KITTI-layout folder.
+
+    Args:
+        root: folder that holds ``training`` (or ``testing``) and, for splits, ``ImageSets``.
+        split: name of a file in ``ImageSets`` (one frame id a line); None for all frames that have a calibration.
+        part: ``training`` or ``testing``.
+        class_names: classes of the ground truth that frames give.
+        image_size: (width, height) of frames whose images are not there and whose calibration is none of KITTI's own.
+
+    Raises:
+        DatasetError: the folder or the split does not exist.
+    """
+
+    def __init__(
+        self,
+        root: Path | str,
+        split: str | None = None,
+        *,
+        part: str = "training",
+        class_names: Sequence[str] = KITTI_CLASSES,
+        image_size: tuple[int, int] = DEFAULT_IMAGE_SIZE,
+    ) -> None:
+        self.root = Path(root)
+        self.folder = self.root / part
+        self.class_names = tuple(class_names)
+        self.default_image_size = image_size
+        if not self.folder.is_dir():
+            raise DatasetError(f"{self.root} has no folder {part!r}; expected the KITTI object layout")
+        self.split = split
+        self.ids = self._all_ids() if split is None else read_frame_ids(self._split_path(split))
+
+    def _split_path(self, split: str) -> Path:
+        path = self.root / "ImageSets" / f"{split}.txt"
+        if not path.is_file():
+            known = sorted(p.stem for p in path.parent.glob("*.txt"))
+            raise DatasetError(f"{path} does not exist; the splits there are: {', '.join(known) or 'none'}")
+        return path
+
+    def _all_ids(self) -> tuple[str, ...]:
+        ids = tuple(sorted(p.stem for p in (self.folder / "calib").glob("*.txt")))
+        if not ids:
+            raise DatasetError(f"{self.folder / 'calib'} holds no calibration files")
+        return ids
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def __getitem__(self, index: int) -> Frame:  # type: ignore[override]
+        return self.frame(self.ids[index])
+
+    @cached_property
+    def _present(self) -> dict[str, dict[str, Path]]:
+        """Files by folder and frame id, listed once."""
+        folders = ("velodyne", "label_2", *(folder for _, folder, _ in CAMERAS))
+        return {
+            name: {p.stem: p for p in (self.folder / name).glob("*")} if (self.folder / name).is_dir() else {}
+            for name in folders
+        }
+
+    def calibration(self, frame_id: str) -> KittiCalibration:
+        """The calibration of a frame."""
+        return read_calibration(self.folder / "calib" / f"{frame_id}.txt")
+
+    def frame(self, frame_id: str) -> Frame:
+        """The frame of that id; scan, images and labels are read when first asked for.
+
+        Raises:
+            DatasetError: its calibration is missing.
+            FormatError: its calibration is malformed.
+        """
+        calibration = self.calibration(frame_id)
+        cameras, images = [], {}
+        for name, folder, projection in CAMERAS:
+            if projection not in calibration.projections:
+                continue
+            path = self._present[folder].get(frame_id)
+            matrix = calibration.projections[projection]
+            if path:
+                images[name] = path
+                width, height = image_size(path)
+                _check_image_size(path, (width, height), matrix)
+            else:
+                width, height = IMAGE_SIZES.get(round(float(matrix[0, 0]), 4), self.default_image_size)
+            cameras.append(Camera(name, matrix, calibration.camera_from_lidar, width, height))
+        scan, label = self._present["velodyne"].get(frame_id), self._present["label_2"].get(frame_id)
+
+        def labels() -> Detections3D:
+            assert label is not None
+            return detections_3d(read_objects(label, results=False), calibration.camera_from_lidar, self.class_names)
+
+        return Frame(
+            frame_id,
+            points=(lambda: read_points(scan)) if scan else None,
+            cameras=cameras,
+            images=_Images(images),
+            labels=labels if label else None,
+        )
