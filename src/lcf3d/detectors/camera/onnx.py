@@ -1,0 +1,273 @@
+"""Camera detectors as ONNX files, run by onnxruntime on the CPU."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lcf3d.detectors.base import Image
+from lcf3d.detectors.camera.onnx_images import instance_masks, prepare_image
+from lcf3d.detectors.camera.onnx_layouts import LAYOUTS, SIZES_INPUT, class_count, identify_layout
+from lcf3d.detectors.camera.tiling import merge_tiles, non_maximum_suppression, tile_spans
+from lcf3d.detectors.classes import COCO_CLASSES, to_classes
+from lcf3d.errors import ConfigError, DetectorError, ShapeError
+from lcf3d.structures import KITTI_CLASSES, Detections2D
+
+# input side for networks that leave it open and do not record it either
+DEFAULT_SIZE = 640
+# no image holds more objects than this; bounds the cost of suppression
+MAX_CANDIDATES = 1000
+_IMAGE_TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
+
+
+class OnnxDetector:
+    """A camera detector in an ONNX file: YOLOX, Ultralytics exports, RT-DETR, D-FINE, DEIM (see `onnx_layouts`).
+
+    Args:
+        path: the ONNX file.
+        class_names: classes the detections shall have; the network's own are mapped by name, persons on bicycles become
+            cyclists (`lcf3d.detectors.classes`).
+        tiles: 1 looks at the whole image only; more add a pass over each of so many overlapping tiles, side by side.
+        score_threshold: detections below it are left out (before classes are mapped).
+        iou_threshold: boxes of a class that overlap more are one object.
+        layout: ``auto``, or a name of `LAYOUTS` where the graph's own inputs and outputs mislead.
+        size: side of the network's input in pixels, or ``HEIGHTxWIDTH``; only for networks that leave it open.
+        names: the network's own classes in their order: a sequence, a comma-separated string or a text file with one
+            name a line. Otherwise its metadata are asked, then COCO is assumed where the number of classes allows.
+        mapping: own class name to target name, where the automatic mapping is not wanted; empty drops the class.
+        normalize: ``none``, or ``imagenet`` for networks that want mean and deviation of ImageNet taken out.
+        threads: threads of onnxruntime; 0 takes all cores.
+
+    Raises:
+        DetectorError: the file is absent, broken or not a detector of a known layout.
+        ConfigError: a setting makes no sense.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        class_names: Sequence[str] = KITTI_CLASSES,
+        tiles: int = 1,
+        score_threshold: float = 0.1,
+        iou_threshold: float = 0.6,
+        layout: str = "auto",
+        size: int | str | None = None,
+        names: str | Sequence[str] | None = None,
+        mapping: Mapping[str, str] | None = None,
+        normalize: str = "none",
+        threads: int = 0,
+    ) -> None:
+        _check_settings(tiles, score_threshold, iou_threshold, layout, normalize)
+        self.path = Path(path)
+        self.class_names = tuple(class_names)
+        self._tiles = tiles
+        self._score_threshold = score_threshold
+        self._iou_threshold = iou_threshold
+        self._mapping = mapping
+        self._imagenet = normalize == "imagenet"
+        self._session = _open_session(self.path, threads)
+        metadata = self._session.get_modelmeta().custom_metadata_map
+        image_input = self._image_input()
+        self._image_name: str = image_input.name
+        self._dtype = _IMAGE_TYPES[image_input.type]
+        self._size = self._input_size(image_input.shape[2:], size, metadata)
+        shapes = self._output_shapes()
+        try:
+            chosen = identify_layout(self._input_names(), shapes, self._size) if layout == "auto" else layout
+        except DetectorError as error:
+            raise DetectorError(f"{self.path} is not a usable camera detector: {error}") from None
+        self._layout = LAYOUTS[chosen]
+        # the graph may list its outputs in any order
+        self._outputs = ["labels", "boxes", "scores"] if chosen == "detr" else list(shapes)
+        if not set(self._outputs) <= set(shapes):
+            raise DetectorError(f"{self.path}: layout detr needs outputs labels, boxes and scores, got {list(shapes)}")
+        self.own_class_names = self._own_names(names, metadata, class_count(chosen, list(shapes.values())))
+
+    @property
+    def layout(self) -> str:
+        """Name of the output layout in use."""
+        return self._layout.name
+
+    def __call__(self, images: Sequence[Image]) -> list[Detections2D]:
+        """Detections of each (H, W, 3) uint8 RGB image, by descending score, in the target classes."""
+        return [self._detect(np.asarray(image)) for image in images]
+
+    def _detect(self, image: Image) -> Detections2D:
+        if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or not image.size:
+            raise ShapeError(f"an image must be (H, W, 3) uint8 RGB, got {image.shape} {image.dtype}")
+        found = self._forward(image)
+        if self._tiles > 1:
+            width = image.shape[1]
+            spans = tile_spans(width, self._tiles)
+            parts = [self._forward(np.ascontiguousarray(image[:, start:stop])) for start, stop in spans]
+            found = merge_tiles(found, parts, spans, width, self._iou_threshold)
+        mapped = to_classes(found, self.class_names, self._mapping)
+        return mapped[np.argsort(-mapped.scores, kind="stable")]
+
+    def _forward(self, image: Image) -> Detections2D:
+        """One pass over one image or tile, in the network's own classes."""
+        values, placement = prepare_image(image, self._size, self._layout, self._imagenet)
+        outputs = self._run(values)
+        try:
+            raw = self._layout.decode(outputs, self._size, self._score_threshold)
+        except DetectorError as error:
+            raise DetectorError(f"{self.path}: {error}") from None
+        boxes = placement.to_image(raw.boxes)
+        usable = np.isfinite(boxes).all(axis=1) & (boxes[:, 2:] > boxes[:, :2]).all(axis=1)
+        kept = np.flatnonzero(usable)
+        kept = kept[np.argsort(-raw.scores[kept], kind="stable")[:MAX_CANDIDATES]]
+        if self._layout.overlapping:
+            kept = kept[non_maximum_suppression(boxes[kept], raw.scores[kept], raw.labels[kept], self._iou_threshold)]
+        labels = raw.labels[kept]
+        if len(labels) and not (labels.min() >= 0 and labels.max() < len(self.own_class_names)):
+            raise DetectorError(
+                f"{self.path} gave class {labels.max()} but {len(self.own_class_names)} class names are known; "
+                "give them with names=..."
+            )
+        masks = None
+        if raw.coefficients is not None and raw.prototypes is not None:
+            masks = instance_masks(raw.coefficients[kept], raw.prototypes, boxes[kept], placement, self._size)
+        scores = np.clip(raw.scores[kept], 0, 1)
+        return Detections2D(boxes[kept], scores, labels, self.own_class_names, masks)
+
+    def _run(self, values: NDArray[np.float32]) -> list[NDArray[Any]]:
+        """The chosen outputs for one prepared input."""
+        inputs: dict[str, NDArray[Any]] = {self._image_name: values.astype(self._dtype, copy=False)}
+        if SIZES_INPUT in self._input_names():
+            # width before height; naming the input's own size keeps the boxes in its pixels
+            inputs[SIZES_INPUT] = np.array([[self._size[1], self._size[0]]], dtype=np.int64)
+        try:
+            return list(self._session.run(self._outputs, inputs))
+        except Exception as error:  # onnxruntime's exceptions share no base class
+            raise DetectorError(f"{self.path} cannot be run on an image: {_first_line(error)}") from error
+
+    def _input_names(self) -> list[str]:
+        return [node.name for node in self._session.get_inputs()]
+
+    def _image_input(self) -> Any:
+        """The graph's image input, the only one beside ``orig_target_sizes``."""
+        nodes = [node for node in self._session.get_inputs() if node.name != SIZES_INPUT]
+        if (
+            len(nodes) == 1
+            and len(nodes[0].shape) == 4
+            and nodes[0].type in _IMAGE_TYPES
+            and nodes[0].shape[1] in (3, None)
+        ):
+            return nodes[0]
+        described = ", ".join(f"{node.name} {node.shape} {node.type}" for node in self._session.get_inputs())
+        raise DetectorError(
+            f"{self.path} is not a camera detector: expected one float image input 1 x 3 x H x W "
+            f"(and at most {SIZES_INPUT} beside it), got {described}"
+        )
+
+    def _input_size(
+        self, dimensions: Sequence[Any], wanted: int | str | None, metadata: Mapping[str, str]
+    ) -> tuple[int, int]:
+        """(height, width) of the input: of the graph, else ``wanted``, else of the metadata, else the default."""
+        asked = _parse_size(wanted)
+        fixed = tuple(d if isinstance(d, int) and d > 0 else None for d in dimensions)
+        if asked is None:
+            recorded = _literal(metadata.get("imgsz"), list)
+            asked = (int(recorded[0]), int(recorded[1])) if recorded and len(recorded) == 2 else (DEFAULT_SIZE,) * 2
+        elif any(f is not None and f != a for f, a in zip(fixed, asked, strict=True)):
+            raise ConfigError(f"{self.path} has a fixed input of {fixed[0]} x {fixed[1]}; leave size={wanted} out")
+        return (fixed[0] or asked[0], fixed[1] or asked[1])
+
+    def _output_shapes(self) -> dict[str, tuple[int, ...]]:
+        """Shape of each output by name; a network that leaves some open is run once to see them."""
+        nodes = self._session.get_outputs()
+        shapes = {node.name: tuple(node.shape) for node in nodes}
+        if all(isinstance(d, int) and d > 0 for shape in shapes.values() for d in shape):
+            return shapes
+        self._outputs = list(shapes)
+        outputs = self._run(np.zeros((1, 3, *self._size), dtype=np.float32))
+        return {node.name: np.shape(output) for node, output in zip(nodes, outputs, strict=True)}
+
+    def _own_names(
+        self, given: str | Sequence[str] | None, metadata: Mapping[str, str], count: int | None
+    ) -> tuple[str, ...]:
+        """The network's own class names, from the user, its metadata or COCO; checked against their number."""
+        names = _read_names(given) if given is not None else _metadata_names(metadata)
+        if names is None and count in (None, len(COCO_CLASSES)):
+            names = COCO_CLASSES
+        if names is None:
+            raise DetectorError(f"{self.path} has {count} classes and does not name them; name them with names=...")
+        if count is not None and len(names) != count:
+            raise DetectorError(f"{self.path} has {count} classes but {len(names)} names were given or recorded")
+        return names
+
+
+def _check_settings(tiles: int, score_threshold: float, iou_threshold: float, layout: str, normalize: str) -> None:
+    if tiles < 1:
+        raise ConfigError(f"tiles must be 1 or more, got {tiles}")
+    for name, value in (("score_threshold", score_threshold), ("iou_threshold", iou_threshold)):
+        if not 0 <= value <= 1:
+            raise ConfigError(f"{name} must be in [0, 1], got {value}")
+    if layout != "auto" and layout not in LAYOUTS:
+        raise ConfigError(f"unknown layout {layout!r}; expected auto, {', '.join(LAYOUTS)}")
+    if normalize not in ("none", "imagenet"):
+        raise ConfigError(f"normalize must be none or imagenet, got {normalize!r}")
+
+
+def _open_session(path: Path, threads: int) -> Any:
+    """An onnxruntime session on the CPU."""
+    import onnxruntime
+
+    if not path.is_file():
+        raise DetectorError(f"{path} does not exist; expected the ONNX file of a camera detector")
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = threads
+    options.log_severity_level = 3
+    try:
+        return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # onnxruntime's exceptions share no base class
+        raise DetectorError(f"{path} cannot be read as an ONNX file: {_first_line(error)}") from error
+
+
+def _parse_size(size: int | str | None) -> tuple[int, int] | None:
+    """(height, width) from a side or ``HEIGHTxWIDTH``."""
+    if size is None:
+        return None
+    sides = str(size).lower().split("x")
+    try:
+        height, width = (int(sides[0]), int(sides[-1])) if len(sides) <= 2 else (0, 0)
+    except ValueError:
+        height = width = 0
+    if height < 32 or width < 32 or height % 32 or width % 32:
+        raise ConfigError(f"size must be a multiple of 32 pixels or HEIGHTxWIDTH of such, got {size!r}")
+    return height, width
+
+
+def _read_names(names: str | Sequence[str]) -> tuple[str, ...]:
+    if not isinstance(names, str):
+        return tuple(names)
+    if Path(names).is_file():
+        lines = Path(names).read_text(encoding="utf-8").splitlines()
+        return tuple(line.strip() for line in lines if line.strip())
+    return tuple(name.strip() for name in names.split(",") if name.strip())
+
+
+def _metadata_names(metadata: Mapping[str, str]) -> tuple[str, ...] | None:
+    """Names from the ``names`` that Ultralytics records as a Python dictionary or list."""
+    names = _literal(metadata.get("names"), dict) or _literal(metadata.get("names"), list)
+    if isinstance(names, dict):
+        names = [names[key] for key in sorted(names, key=int)]
+    return tuple(str(name) for name in names) if names else None
+
+
+def _literal(text: str | None, kind: type) -> Any:
+    """The Python literal in ``text`` if it is one of ``kind``, else None."""
+    try:
+        value = ast.literal_eval(text or "")
+    except (ValueError, SyntaxError):
+        return None
+    return value if isinstance(value, kind) else None
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__

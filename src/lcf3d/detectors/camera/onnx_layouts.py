@@ -1,0 +1,209 @@
+"""The output layouts of common camera detectors: how each wants its image and how its outputs become boxes.
+
+- ``yolox`` (YOLOX): one output 1 x M x (5 + classes) of cell offsets, log sizes, objectness and class scores. Image:
+  BGR 0-255, letterbox in the top left corner.
+- ``ultralytics`` (YOLOv8 and later exports): one output 1 x (4 + classes [+ K]) x M of centre, size, class scores and,
+  in segmentation exports, K mask coefficients, with 1 x K x h x w prototypes as second output. Image: RGB 0-1, centred
+  letterbox.
+- ``end2end`` (exports with suppression inside, YOLOv10, YOLO26): one output 1 x N x (6 [+ K]) of corners, score, class
+  and mask coefficients, with prototypes as above. Image: as ``ultralytics``.
+- ``detr`` (RT-DETR, D-FINE, DEIM, DEIMv2): outputs ``labels``, ``boxes``, ``scores``, second input
+  ``orig_target_sizes``. Image: RGB 0-1, stretched to the input.
+
+M is the number of cells of the grids of strides 8, 16 and 32, which tells ``yolox`` and ``ultralytics`` apart.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lcf3d.errors import DetectorError
+from lcf3d.structures import FloatArray, IntArray
+
+STRIDES = (8, 16, 32)
+SIZES_INPUT = "orig_target_sizes"
+Fit = Literal["corner", "centre", "stretch"]
+
+
+@dataclass(frozen=True)
+class RawDetections:
+    """What one forward pass found, in pixels of the network's input.
+
+    Attributes:
+        boxes: (N, 4) corners.
+        scores: (N,).
+        labels: (N,) indices into the network's own classes.
+        coefficients: (N, K) mask coefficients, or None.
+        prototypes: (K, h, w) mask prototypes over the whole input, or None.
+    """
+
+    boxes: FloatArray
+    scores: FloatArray
+    labels: IntArray
+    coefficients: NDArray[np.floating] | None = None
+    prototypes: NDArray[np.floating] | None = None
+
+
+@dataclass(frozen=True)
+class Layout:
+    """How to feed a network and read its outputs.
+
+    Attributes:
+        name: as in the table of this module.
+        fit: how the image is brought to the input size; ``corner`` and ``centre`` keep its proportions.
+        bgr: the channels are blue, green, red.
+        divisor: pixel values are divided by it.
+        overlapping: boxes still need non-maximum suppression.
+        decode: ``(outputs, (height, width) of the input, lowest score)`` to detections.
+    """
+
+    name: str
+    fit: Fit
+    bgr: bool
+    divisor: float
+    overlapping: bool
+    decode: Callable[[Sequence[NDArray[Any]], tuple[int, int], float], RawDetections]
+
+
+def cell_count(size: tuple[int, int]) -> int:
+    """Number of grid cells of all `STRIDES` for an input of (height, width)."""
+    return sum((size[0] // s) * (size[1] // s) for s in STRIDES)
+
+
+def identify_layout(
+    input_names: Sequence[str], output_shapes: Mapping[str, tuple[int, ...]], size: tuple[int, int]
+) -> str:
+    """The layout's name, from the graph's inputs and outputs.
+
+    Args:
+        input_names: of all inputs.
+        output_shapes: shape of each output by name, in the graph's order, all dimensions known.
+        size: (height, width) of the image input.
+
+    Raises:
+        DetectorError: they fit none.
+    """
+    if {"labels", "boxes", "scores"} <= set(output_shapes):
+        return "detr"
+    shapes = list(output_shapes.values())
+    masks = shapes[1][1] if len(shapes) > 1 and len(shapes[1]) == 4 else 0
+    if len(input_names) == 1 and shapes and len(shapes[0]) == 3:
+        _, rows, columns = shapes[0]
+        if rows == cell_count(size) and columns >= 6:
+            return "yolox"
+        if columns == cell_count(size) and rows >= 5 + masks:
+            return "ultralytics"
+        if columns == 6 + masks:
+            return "end2end"
+    described = ", ".join(f"{name} {list(shape)}" for name, shape in output_shapes.items())
+    raise DetectorError(
+        f"its outputs ({described}, for an input of {size[0]} x {size[1]}) are not those of a known detector; known "
+        f"layouts: {', '.join(LAYOUTS)}; name one with layout=... if the automatic choice is wrong"
+    )
+
+
+def class_count(layout: str, output_shapes: Sequence[tuple[int, ...]]) -> int | None:
+    """How many classes the network tells apart, None where its outputs do not say."""
+    if layout == "yolox":
+        return output_shapes[0][2] - 5
+    if layout == "ultralytics":
+        return output_shapes[0][1] - 4 - (output_shapes[1][1] if len(output_shapes) > 1 else 0)
+    return None
+
+
+def decode_yolox(outputs: Sequence[NDArray[Any]], size: tuple[int, int], lowest: float) -> RawDetections:
+    """Cell offsets in cells and log sizes in strides; score = objectness x class score."""
+    table = _rows(outputs[0], cell_count(size), axis=0, layout="yolox")
+    scores, labels = _best_class(table[:, 5:])
+    scores = scores * table[:, 4]
+    kept = np.flatnonzero(scores >= lowest)
+    cells, strides = _grid(size)
+    centres = (table[kept, :2] + cells[kept]) * strides[kept, None]
+    sides = np.exp(table[kept, 2:4]) * strides[kept, None]
+    return RawDetections(_corners(centres, sides), scores[kept], labels[kept])
+
+
+def decode_ultralytics(outputs: Sequence[NDArray[Any]], size: tuple[int, int], lowest: float) -> RawDetections:
+    """One column an anchor: centre and size in input pixels, class scores, mask coefficients."""
+    table = _rows(outputs[0], cell_count(size), axis=1, layout="ultralytics").T
+    prototypes = _prototypes(outputs)
+    end = table.shape[1] - (0 if prototypes is None else len(prototypes))
+    scores, labels = _best_class(table[:, 4:end])
+    kept = np.flatnonzero(scores >= lowest)
+    return RawDetections(
+        _corners(table[kept, :2].astype(np.float64), table[kept, 2:4].astype(np.float64)),
+        scores[kept],
+        labels[kept],
+        None if prototypes is None else table[kept, end:],
+        prototypes,
+    )
+
+
+def decode_end2end(outputs: Sequence[NDArray[Any]], size: tuple[int, int], lowest: float) -> RawDetections:
+    """One row a detection: corners in input pixels, score, class, mask coefficients."""
+    table = _rows(outputs[0], None, axis=0, layout="end2end")
+    prototypes = _prototypes(outputs)
+    table = table[table[:, 4] >= lowest]
+    return RawDetections(
+        table[:, :4].astype(np.float64),
+        table[:, 4].astype(np.float64),
+        table[:, 5].astype(np.int64),
+        None if prototypes is None else table[:, 6:],
+        prototypes,
+    )
+
+
+def decode_detr(outputs: Sequence[NDArray[Any]], size: tuple[int, int], lowest: float) -> RawDetections:
+    """Labels, corners and scores of the queries; the runner names the input size as the original size."""
+    labels, boxes, scores = (np.asarray(output)[0] for output in outputs)
+    kept = scores >= lowest
+    return RawDetections(boxes[kept].astype(np.float64), scores[kept].astype(np.float64), labels[kept].astype(np.int64))
+
+
+LAYOUTS: dict[str, Layout] = {
+    layout.name: layout
+    for layout in (
+        Layout("yolox", "corner", True, 1.0, True, decode_yolox),
+        Layout("ultralytics", "centre", False, 255.0, True, decode_ultralytics),
+        Layout("end2end", "centre", False, 255.0, False, decode_end2end),
+        Layout("detr", "stretch", False, 255.0, False, decode_detr),
+    )
+}
+
+
+def _rows(output: NDArray[Any], count: int | None, axis: int, layout: str) -> NDArray[Any]:
+    """The one image's table of an output, checked to have ``count`` anchors along ``axis``."""
+    if output.ndim != 3 or (count is not None and output.shape[1 + axis] != count):
+        expected = f"1 x {count} x C" if axis == 0 else f"1 x C x {count}"
+        raise DetectorError(f"layout {layout} expects an output {expected}, got {list(output.shape)}")
+    table: NDArray[Any] = output[0]
+    return table
+
+
+def _best_class(scores: NDArray[Any]) -> tuple[FloatArray, IntArray]:
+    labels = scores.argmax(axis=1)
+    best = np.take_along_axis(scores, labels[:, None], axis=1)[:, 0]
+    return best.astype(np.float64), labels.astype(np.int64)
+
+
+def _prototypes(outputs: Sequence[NDArray[Any]]) -> NDArray[np.floating] | None:
+    return outputs[1][0] if len(outputs) > 1 and outputs[1].ndim == 4 else None
+
+
+def _corners(centres: FloatArray, sides: FloatArray) -> FloatArray:
+    return np.concatenate([centres - sides / 2, centres + sides / 2], axis=1)
+
+
+def _grid(size: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
+    """(M, 2) column and row of each cell, and (M,) its stride; finest grid first, row by row."""
+    cells, strides = [], []
+    for stride in STRIDES:
+        rows, columns = np.mgrid[: size[0] // stride, : size[1] // stride]
+        cells.append(np.stack([columns.ravel(), rows.ravel()], axis=1))
+        strides.append(np.full(rows.size, stride))
+    return np.concatenate(cells).astype(np.float64), np.concatenate(strides).astype(np.float64)
