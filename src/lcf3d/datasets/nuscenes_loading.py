@@ -50,7 +50,7 @@ def load_tables(root: Path, version: str) -> NuscenesTables:
 
 
 def read_tables(root: Path, version: str) -> tuple[NuscenesTables, list[Finding]]:
-    """The tables, with every inconsistency met on the way (rules NUS02 to NUS06 of `check_nuscenes`).
+    """The tables, with every inconsistency met on the way (rules NUS02 to NUS08 of `check_nuscenes`).
 
     Raises:
         DatasetError: a folder or table is absent or malformed, so that reading cannot go on.
@@ -242,10 +242,10 @@ def _read_sensor_data(reader: _Reader, sample_index: _TokenIndex) -> SensorData:
     previous[is_lidar] = reader.resolve(
         own_index, data["prev"][is_lidar], "sample_data", own[is_lidar], "prev", optional=True
     )
-    for i in np.flatnonzero(
-        (channel >= 0) & ~is_lidar & ~np.isfinite(calibration["camera_intrinsic"]).all((1, 2))[calibrations]
-    ):
-        reader.error("NUS06", f"sample_data.json: camera recording {own[i].decode()} has no camera_intrinsic")
+    camera = (channel >= 0) & ~is_lidar
+    known = np.isfinite(calibration["camera_intrinsic"]).all(axis=(1, 2))[calibrations]
+    for i in np.flatnonzero(camera & ~(known & (data["width"] > 0) & (data["height"] > 0))):
+        reader.error("NUS06", f"sample_data.json: image {own[i].decode()} has no camera_intrinsic, width or height")
     return SensorData(
         own,
         rows,

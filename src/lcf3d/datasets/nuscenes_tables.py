@@ -147,10 +147,12 @@ class NuscenesTables:
         """
         if camera not in CAMERAS:
             raise ConfigError(f"nuScenes has no camera {camera!r}; its cameras are {', '.join(CAMERAS)}")
-        return self.samples.cameras[sample_rows, CAMERAS.index(camera)]
+        rows: IntArray = self.samples.cameras[sample_rows, CAMERAS.index(camera)]
+        return rows
 
     def rows_of_scenes(self, names: Collection[str]) -> IntArray:
         """(S,) rows of the samples in the named scenes, scene by scene in table order, each in order of time."""
         chosen = np.array([name in names for name in self.scene_names], dtype=bool)
         rows = np.flatnonzero(chosen[self.samples.scenes])
-        return rows[np.lexsort((self.samples.timestamps_us[rows], self.samples.scenes[rows]))]
+        ordered: IntArray = rows[np.lexsort((self.samples.timestamps_us[rows], self.samples.scenes[rows]))]
+        return ordered

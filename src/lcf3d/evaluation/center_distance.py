@@ -147,7 +147,7 @@ def _match(
 
 @njit(cache=True, nogil=True)
 def _greedy_matches(annotated, starts, predicted, groups, thresholds):  # type: ignore[no-untyped-def]
-    """(T, N) row of ``annotated`` that each of ``predicted`` takes in turn; rows of group g: starts[g]:starts[g + 1]."""
+    """(T, N) row of ``annotated`` that each of ``predicted`` takes in turn; group g has rows starts[g]:starts[g+1]."""
     matches = np.full((len(thresholds), len(predicted)), -1, dtype=np.int64)
     for t in range(len(thresholds)):
         free = np.ones(len(annotated), dtype=np.bool_)
@@ -211,6 +211,6 @@ def _running_means(errors: FloatArray) -> FloatArray:
     known = ~np.isnan(errors)
     counts = np.cumsum(known, axis=1)
     sums = np.cumsum(np.where(known, errors, 0), axis=1)
-    means = np.divide(sums, counts, out=np.zeros_like(sums), where=counts > 0)
+    means: FloatArray = np.divide(sums, counts, out=np.zeros_like(sums), where=counts > 0)
     means[~known.any(axis=1)] = 1
     return means

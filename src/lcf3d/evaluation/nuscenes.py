@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,7 +20,6 @@ from lcf3d.formats.nuscenes_boxes import GlobalBoxes
 from lcf3d.geometry.rotation import invert_rigid, rigid_transforms, rotation_matrices, yaws_from_quaternions
 from lcf3d.structures import NUSCENES_CLASSES, BoolArray, FloatArray, IntArray
 
-_REPORT_ERRORS = ("trans_err", "scale_err", "orient_err", "vel_err", "attr_err")
 _DETAIL_ERRORS = ("trans_err", "vel_err", "scale_err", "orient_err", "attr_err")
 _CYCLES = (NUSCENES_CLASSES.index("bicycle"), NUSCENES_CLASSES.index("motorcycle"))
 

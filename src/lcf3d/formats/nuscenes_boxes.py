@@ -7,7 +7,7 @@ on these boxes as they are; nothing passes through the LiDAR frame unless asked.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -229,3 +229,14 @@ def _global_from_one(
         attributes,
         np.full(n, -1, dtype=np.int64),
     )
+
+
+def split_by_sample(boxes: GlobalBoxes) -> dict[str, GlobalBoxes]:
+    """The boxes of each sample by its token, in order; each part lists its own token only."""
+    order = np.argsort(boxes.samples, kind="stable")
+    ends = np.cumsum(np.bincount(boxes.samples, minlength=len(boxes.sample_tokens)))
+    result = {}
+    for i, token in enumerate(boxes.sample_tokens):
+        part = boxes[order[(ends[i - 1] if i else 0) : ends[i]]]
+        result[token] = replace(part, sample_tokens=(token,), samples=np.zeros(len(part), dtype=np.int64))
+    return result
