@@ -35,7 +35,7 @@ class ShapeGroupHead(nn.Module):
         super().__init__()
         convs = []
         for stride in strides:
-            convs.append(ConvModule(in_channels, 64, 3, stride))
+            convs.append(ConvModule(in_channels, 64, 3, stride, eps=1e-5))
             in_channels = 64
         self.shared_conv = nn.Sequential(*convs)
         anchors = sizes * len(spec.rotations)
