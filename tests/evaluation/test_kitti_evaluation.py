@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from kitti_frames import dontcare, frames
+from tests.evaluation.kitti_frames import dontcare, frames
 
 from lcf3d.errors import ConfigError, DatasetError, FormatError
 from lcf3d.evaluation.curves import precision_curve
@@ -17,6 +17,7 @@ from lcf3d.evaluation.kitti import (
     evaluate_folder,
     read_evaluator,
     result_folder,
+    split_frame_ids,
 )
 from lcf3d.formats.kitti import KittiFrames, KittiObjects, format_objects, read_folder, read_frame_ids
 
@@ -180,8 +181,12 @@ def test_evaluation_from_files(tmp_path: Path) -> None:
     assert evaluate_folder(tmp_path, data, missing="empty").ap("Car", "3d") < 100
     with pytest.raises(DatasetError, match="is not a folder"):
         evaluate_folder(tmp_path, tmp_path / "nowhere")
-    with pytest.raises(DatasetError, match=r"test\.txt does not exist"):
+    with pytest.raises(DatasetError, match="no split 'test'; the lists in its ImageSets are: val"):
         evaluate_folder(tmp_path, data, split="test")
+    (tmp_path / "ImageSets" / "val.txt").unlink()
+    assert split_frame_ids(tmp_path) == tuple(sorted(map(str, range(41))))  # all that are labelled
+    with pytest.raises(DatasetError, match="expected a KITTI tree"):
+        evaluate_folder(tmp_path / "run", data)
 
 
 GOLDEN = (

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from kitti_frames import dontcare, frames
+from tests.evaluation.kitti_frames import dontcare, frames
 from shapely import affinity
 from shapely.geometry import Polygon, box
 

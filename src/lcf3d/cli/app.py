@@ -10,7 +10,10 @@ import typer
 from lcf3d.errors import Lcf3dError
 
 # verb -> module of lcf3d.cli that defines a function of that name; heavy imports stay inside the functions
-VERBS: dict[str, str] = {}
+VERBS: dict[str, str] = {
+    "run": "run",
+    "config": "config",
+}
 
 app = typer.Typer(
     name="lcf3d",

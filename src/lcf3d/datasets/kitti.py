@@ -71,11 +71,11 @@ def read_calibration(path: Path) -> KittiCalibration:
     rectification[:3, :3] = _matrix(path, entries, ("R0_rect", "R_rect"), (3, 3))
     reference_from_lidar = np.eye(4)
     reference_from_lidar[:3] = _matrix(path, entries, ("Tr_velo_to_cam", "Tr_velo_cam"), (3, 4))
-    projections = {
-        name: _matrix(path, entries, (name,), (3, 4)) for name in ("P0", "P1", "P2", "P3") if name in entries
-    }
-    if "P2" not in projections:
-        raise FormatError(f"{path} has no entry P2")
+    projections: dict[str, FloatArray] = {"P2": _matrix(path, entries, ("P2",), (3, 4))}
+    others: tuple[str, ...] = ("P0", "P1", "P3")
+    for name in others:
+        if name in entries:
+            projections[name] = _matrix(path, entries, (name,), (3, 4))
     return KittiCalibration(projections, rectification @ reference_from_lidar)
 
 
@@ -234,6 +234,20 @@ class KittiDataset(Sequence[Frame]):
             name: {p.stem: p for p in (self.folder / name).glob("*")} if (self.folder / name).is_dir() else {}
             for name in folders
         }
+
+    def require_calibrations(self) -> None:
+        """See that every frame of the split has a calibration file, before any work begins.
+
+        Raises:
+            DatasetError: some have none; says how many and which first.
+        """
+        present = {p.stem for p in (self.folder / "calib").glob("*.txt")}
+        absent = [frame_id for frame_id in self.ids if frame_id not in present]
+        if absent:
+            raise DatasetError(
+                f"{self.folder / 'calib'} lacks {len(absent)} of {len(self.ids)} frames, first {absent[0]}.txt; "
+                "copy the calibration files or leave those frames out of the split"
+            )
 
     def calibration(self, frame_id: str) -> KittiCalibration:
         """The calibration of a frame."""

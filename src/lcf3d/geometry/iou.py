@@ -83,7 +83,7 @@ def bev_intersection(ax, ay, a_length, a_width, a_yaw, bx, by, b_length, b_width
         + _clipped_edge_integral(x2, y2, x3, y3, half_length, half_width)
         + _clipped_edge_integral(x3, y3, x0, y0, half_length, half_width)
     )
-    return min(max(area, 0.0), min(a_length * a_width, b_length * b_width))
+    return min(area, a_length * a_width, b_length * b_width) if area > 0.0 else 0.0
 
 
 @njit(cache=True, nogil=True)
