@@ -16,7 +16,7 @@ from typing import Any, Literal
 import numpy as np
 
 from lcf3d.errors import ConfigError, DatasetError, FormatError
-from lcf3d.evaluation.curves import PrecisionCurve, Sampling, ScoreEvents, precision_curve
+from lcf3d.evaluation.curves import SAMPLES, PrecisionCurve, Sampling, ScoreEvents, precision_curve
 from lcf3d.evaluation.kitti_matching import COUNTS, IGNORED, OTHER, match_at, overlaps, score_events
 from lcf3d.formats.kitti import KittiFrames, read_folder, read_frame_ids
 from lcf3d.structures import FloatArray, IntArray
@@ -97,7 +97,8 @@ class KittiMetrics:
 
     Attributes:
         curves: by (class, measure, difficulty); classes and measures that the results do not cover are absent, as in
-            the official program: no detection of the class, no 3D boxes, an unknown alpha (-10) for AOS.
+            the official program: no detection of the class, no 3D boxes, an unknown alpha (-10) for AOS. AOS is absent
+            too where all detections have one and the same alpha and the objects have not.
         frame_count: number of frames evaluated.
         config: the numbers used.
     """
@@ -110,6 +111,10 @@ class KittiMetrics:
     def class_names(self) -> tuple[str, ...]:
         """The classes that the results cover."""
         return tuple(dict.fromkeys(name for name, _, _ in self.curves))
+
+    def measures(self, class_name: str) -> tuple[str, ...]:
+        """The measures that the results cover for a class."""
+        return tuple(measure for measure in MEASURES if (class_name, measure, DIFFICULTIES[0]) in self.curves)
 
     def ap(
         self, class_name: str, measure: str = "3d", difficulty: str = "moderate", sampling: Sampling = "R40"
@@ -190,7 +195,7 @@ class KittiEvaluator:
     def covered(self) -> dict[str, tuple[str, ...]]:
         """The measures that can be evaluated, by class, after the official program's rules."""
         objects = self.results.objects
-        oriented = bool((objects.alpha != -10).all())
+        oriented = bool((objects.alpha != -10).all()) and not self._same_alpha_everywhere()
         located = (objects.locations[:, ::2] != -1000).all(axis=1) & (objects.dimensions[:, 1:] > 0).all(axis=1)
         upright = located & (objects.locations[:, 1] != -1000) & (objects.dimensions[:, 0] > 0)
         covered = {}
@@ -204,6 +209,11 @@ class KittiEvaluator:
             has["aos"] = has["bbox"] and oriented
             covered[name] = tuple(measure for measure in MEASURES if has[measure])
         return covered
+
+    def _same_alpha_everywhere(self) -> bool:
+        """Whether the detector writes one alpha for all it finds, while the objects have many: it estimates none."""
+        found, real = self.results.objects.alpha, self.truth.objects.alpha
+        return len(found) >= SAMPLES and len(np.unique(found)) == 1 and len(np.unique(real[real != -10])) > 1
 
     def codes(self, selection: Selection) -> tuple[IntArray, IntArray]:
         """What each object (N,) and each detection (M,) is to the selection: `COUNTS`, `IGNORED` or `OTHER`."""
@@ -282,7 +292,7 @@ def evaluate(
 def evaluate_folder(
     root: Path,
     results: Path,
-    split: str = "val",
+    split: str | None = None,
     config: KittiEvaluationConfig = KittiEvaluationConfig(),
     missing: Literal["error", "empty"] = "error",
 ) -> KittiMetrics:
@@ -293,16 +303,16 @@ def evaluate_folder(
 def read_evaluator(
     root: Path,
     results: Path,
-    split: str = "val",
+    split: str | None = None,
     config: KittiEvaluationConfig = KittiEvaluationConfig(),
     missing: Literal["error", "empty"] = "error",
 ) -> KittiEvaluator:
     """Read ground truth and results from files.
 
     Args:
-        root: the folder that holds ``training/label_2`` and ``ImageSets/{split}.txt``.
+        root: the folder that holds ``training/label_2`` and, for splits, ``ImageSets/SPLIT.txt``.
         results: folder of one text file a frame, or one that holds such a folder named ``data``.
-        split: name of the list of frames.
+        split: name of the list of frames; None for ``val`` where there is such a list, else all labelled frames.
         config: the numbers of the benchmark.
         missing: what to do about frames without a result file: ``error`` or take them as ``empty``.
 
@@ -310,10 +320,33 @@ def read_evaluator(
         DatasetError: a file or folder is absent; for frames, says how many and which first.
         FormatError: a file is malformed; names file and line.
     """
-    root = Path(root)
-    frame_ids = read_frame_ids(root / "ImageSets" / f"{split}.txt")
-    truth = read_folder(root / "training" / "label_2", frame_ids, results=False)
+    frame_ids = split_frame_ids(root, split)
+    truth = read_folder(Path(root) / "training" / "label_2", frame_ids, results=False)
     return KittiEvaluator(truth, read_folder(result_folder(results), frame_ids, results=True, missing=missing), config)
+
+
+def split_frame_ids(root: Path, split: str | None = None) -> tuple[str, ...]:
+    """The frames of a split; None means ``val`` where there is such a list, else all labelled frames.
+
+    Raises:
+        DatasetError: the folder is not a KITTI tree, or has no such split; names those it has.
+    """
+    root = Path(root)
+    labels = root / "training" / "label_2"
+    if not labels.is_dir():
+        raise DatasetError(f"{labels} is not a folder; expected a KITTI tree with training/label_2 in {root}")
+    known = sorted(path.stem for path in (root / "ImageSets").glob("*.txt"))
+    if split is None and "val" not in known:
+        frame_ids = tuple(sorted(path.stem for path in labels.glob("*.txt")))
+        if not frame_ids:
+            raise DatasetError(f"{labels} holds no label files")
+        return frame_ids
+    name = split or "val"
+    if name not in known:
+        raise DatasetError(
+            f"{root} has no split {name!r}; the lists in its ImageSets are: {', '.join(known) or 'none'}"
+        )
+    return read_frame_ids(root / "ImageSets" / f"{name}.txt")
 
 
 def result_folder(results: Path) -> Path:

@@ -194,7 +194,7 @@ def read_folder(folder: Path, frame_ids: Sequence[str], results: bool, missing: 
     if absent and missing == "error":
         raise DatasetError(
             f"{folder} lacks the files of {len(absent)} of {len(frame_ids)} frames, first {absent[0]}.txt; "
-            "add them (an empty file means no objects) or leave those frames out of the split"
+            "add them (an empty file means no objects), or ask for missing ones to be taken as empty"
         )
     skip = set(absent)
     paths = [None if frame_id in skip else folder / f"{frame_id}.txt" for frame_id in frame_ids]
