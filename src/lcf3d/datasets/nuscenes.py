@@ -271,8 +271,8 @@ class NuscenesDataset(Sequence[Frame]):
             return False
         if self.late_cameras == "error":
             raise DatasetError(
-                f"sample {token}: {name} is {delay:.3f} s away from the LiDAR sweep, the limit is {self.max_camera_delay_s} "
-                "s; raise max_camera_delay_s, or leave late cameras out with late_cameras='drop'"
+                f"sample {token}: {name} is {delay:.3f} s away from the LiDAR sweep, the limit is "
+                f"{self.max_camera_delay_s} s; raise max_camera_delay_s or leave it out with late_cameras='drop'"
             )
         return True
 

@@ -101,6 +101,7 @@ class NuscenesMetrics:
         aps: (C, T) average precision by class and matching distance.
         class_errors: (C, 5) errors (`ERRORS`) by class, NaN where a class has none.
         curves: curves by class and matching distance.
+        ground_truth_counts: (C,) annotated boxes by class after the filters.
         counts: filter counts of ``predictions`` and ``ground_truth``.
         meta: what the submission says of its inputs.
     """
@@ -109,6 +110,7 @@ class NuscenesMetrics:
     config: NuscenesMetricsConfig
     aps: FloatArray
     class_errors: FloatArray
+    ground_truth_counts: tuple[int, ...]
     curves: list[list[Curve]] = field(repr=False)
     counts: Mapping[str, FilterCounts]
     meta: Mapping[str, Any] = field(default_factory=dict)
@@ -250,7 +252,8 @@ def metrics_of_boxes(
     for name, undefined in config.undefined.items():
         if name in class_names:
             errors[class_names.index(name), [ERRORS.index(error) for error in undefined]] = np.nan
-    return NuscenesMetrics(class_names, config, aps, errors, curves, counts, meta)
+    annotated = tuple(np.bincount(ground_truth.labels, minlength=len(class_names)).tolist())
+    return NuscenesMetrics(class_names, config, aps, errors, annotated, curves, counts, meta)
 
 
 def boxes_in_range(boxes: GlobalBoxes, ego: FloatArray, config: NuscenesMetricsConfig = OFFICIAL) -> BoolArray:
@@ -265,6 +268,11 @@ def _aligned(predictions: GlobalBoxes, tokens: tuple[str, ...]) -> GlobalBoxes:
     """``predictions`` with sample numbers of ``tokens``, box order kept."""
     position = {token: i for i, token in enumerate(tokens)}
     missing = set(tokens) - set(predictions.sample_tokens)
+    if missing and len(missing) == len(tokens):
+        raise FormatError(
+            f"the results hold none of the {len(tokens)} samples of this split, the first of which is {tokens[0]}; "
+            "check version and split"
+        )
     if missing:
         first = next(token for token in tokens if token in missing)
         raise FormatError(
