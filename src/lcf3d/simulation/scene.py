@@ -1,0 +1,132 @@
+"""A whole scene: a site with its scenery and road users, frozen at any moment of a drive."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lcf3d.errors import ConfigError
+from lcf3d.simulation.actors import Actor, Motion
+from lcf3d.simulation.meshes.primitives import Mesh
+from lcf3d.simulation.roads import Path, Terrain
+from lcf3d.simulation.scenery import Site, build_scenery
+from lcf3d.simulation.streets import STREET_NAMES, STREETS
+from lcf3d.simulation.traffic import populate
+
+
+@dataclass(frozen=True, eq=False)
+class Snapshot:
+    """The triangles of a scene at one moment.
+
+    Attributes:
+        mesh: all triangles, in the world.
+        owner: (T,) int32 id of the actor that a triangle belongs to, 0 for scenery.
+    """
+
+    mesh: Mesh
+    owner: NDArray[np.int32]
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A street with everything on it.
+
+    Attributes:
+        site: the street.
+        static: triangles that never move.
+        actors: road users.
+        ego: how the sensors travel.
+        sun: (3,) unit vector towards the sun.
+        cloudiness: 0 clear to 1 overcast.
+        haze_m: distance at which the air has taken about two thirds of the contrast.
+        look: seed of what depends on the light only (clouds).
+    """
+
+    site: Site
+    static: Mesh
+    actors: tuple[Actor, ...]
+    ego: Motion
+    sun: NDArray[np.float64]
+    cloudiness: float
+    haze_m: float
+    look: int
+
+    def at(self, time: float) -> Snapshot:
+        """The scene ``time`` seconds into the drive."""
+        meshes = [actor.mesh(time, self.site.terrain) for actor in self.actors]
+        owner = [np.zeros(len(self.static), dtype=np.int32)]
+        owner += [np.full(len(m), a.id, dtype=np.int32) for a, m in zip(self.actors, meshes, strict=True)]
+        return Snapshot(Mesh.join([self.static, *meshes]), np.concatenate(owner))
+
+    def boxes(self, time: float) -> NDArray[np.float64]:
+        """(A, 7) world boxes of the actors."""
+        return np.array([a.box(time, self.site.terrain) for a in self.actors], dtype=np.float64).reshape(-1, 7)
+
+    def with_actors(self, actors: Sequence[Actor]) -> Scene:
+        """The same street with other road users."""
+        return replace(self, actors=tuple(actors))
+
+
+def build_scene(
+    rng: np.random.Generator,
+    dataset: str = "kitti",
+    duration: float = 0.0,
+    street: str | None = None,
+    density: float = 1.0,
+) -> Scene:
+    """A random scene in which the sensors start at the world's origin, on the right-hand lane.
+
+    Args:
+        rng: random numbers; equal state gives an equal scene.
+        dataset: ``kitti`` or ``nuscenes``, whose size statistics and mix of road users to follow.
+        duration: length of the drive in seconds.
+        street: a name of ``STREET_NAMES``; None draws one.
+        density: factor on the number of road users.
+
+    Raises:
+        ConfigError: unknown street, a density that is not positive, or more road users than the street can hold.
+    """
+    if street is not None and street not in STREET_NAMES:
+        raise ConfigError(f"unknown street {street!r}; use one of {', '.join(STREET_NAMES)}")
+    if not 0 < density <= 20:
+        raise ConfigError(f"density must lie above 0 and at most 20, got {density:g}")
+    shares = np.array([s.share for s in STREETS])
+    drawn = int(rng.choice(len(STREETS), p=shares / shares.sum()))
+    kind = STREETS[drawn if street is None else STREET_NAMES.index(street)]
+    speed = 0.0 if rng.random() < 0.18 else kind.speed * float(rng.uniform(0.5, 1.15))
+    first, last = -75.0, 125.0 + speed * duration
+    terrain = Terrain(tuple(rng.uniform(0, 6.28, 3)), float(rng.uniform(0.02, 0.12)))  # type: ignore[arg-type]
+    bend = 0.0 if rng.random() < 0.55 else float(rng.normal(0, 1 / 260))
+    heading = 0.0
+    drive = kind.half_width - (2.1 if kind.parking is not None else 0.0)
+    lane = drive * (0.5 if kind.lanes == 1 else 0.74)
+    path = Path((first, lane), heading, first - 5, last + 5, bend)
+    crossings, sides = _crossings(path, kind.crossings, kind.half_width, last, rng)
+    site = Site(kind, path, terrain, first, last, crossings, sides)
+    ego = Motion(path, 0.0, -lane, speed)
+    static = build_scenery(site, rng)
+    actors = populate(site, ego, dataset, duration, density, rng)
+    cloudiness = float(np.clip(rng.beta(1.1, 1.6), 0, 1))
+    azimuth, elevation = rng.uniform(-np.pi, np.pi), np.radians(rng.uniform(24, 58))
+    sun = np.array([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)])
+    return Scene(site, static, tuple(actors), ego, sun, cloudiness, float(rng.uniform(350, 1400)), int(rng.integers(2**31)))
+
+
+def _crossings(
+    path: Path, chance: float, half_width: float, last: float, rng: np.random.Generator
+) -> tuple[tuple[tuple[float, float], ...], tuple[Path, ...]]:
+    """Side streets: where, how wide, and their centre lines to both sides."""
+    places, sides = [], []
+    s = float(rng.uniform(14, 60))
+    while s < last - 15 and len(places) < 3:
+        if rng.random() < chance:
+            half = float(rng.uniform(2.8, 3.8))
+            places.append((s, half))
+            x, y, heading = path.at(s)
+            for way in (1.0, -1.0):
+                sides.append(Path((float(x), float(y)), float(heading) + way * np.pi / 2, 0.0, half_width + 75.0))
+        s += float(rng.uniform(45, 90))
+    return tuple(places), tuple(sides)
