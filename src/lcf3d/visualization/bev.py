@@ -1,0 +1,179 @@
+"""The bird's-eye view: points, boxes, fields of view and range rings, seen from above."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import PIL.Image
+from numpy.typing import NDArray
+
+from lcf3d.geometry.boxes import LENGTH, YAW, bev_corners
+from lcf3d.structures import Camera, FloatArray
+from lcf3d.visualization.canvas import Canvas
+from lcf3d.visualization.scene import COLOURS, TRUTH_COLOUR, Scene
+
+_GROUND = (16, 18, 22)
+_RING = (70, 76, 84)
+_RING_TEXT = (140, 148, 158)
+_VIEW = (110, 118, 128)
+# heights between which points go from dark to bright, metres in the LiDAR frame
+_HEIGHTS = (-2.0, 2.0)
+_LOW, _HIGH = np.array([58.0, 66.0, 82.0]), np.array([165.0, 178.0, 190.0])
+RING_STEP = 10.0
+# metres around the outermost box centres, and pixels left of the LiDAR where forward is right
+MARGIN, LEFT_EDGE = 6.0, 24.0
+
+
+@dataclass(frozen=True)
+class BevView:
+    """Which part of the ground a picture shows, and at what scale.
+
+    Attributes:
+        width: of the picture in pixels.
+        height: of the picture in pixels.
+        pixels_per_metre: scale.
+        origin: pixel (column, row) of the LiDAR.
+        forward: where x points, ``right`` or ``up``.
+    """
+
+    width: int
+    height: int
+    pixels_per_metre: float
+    origin: tuple[float, float]
+    forward: Literal["right", "up"] = "up"
+
+    @classmethod
+    def fit(cls, boxes: FloatArray, cameras: Sequence[Camera], width: int, height: int) -> BevView:
+        """A view in which (N, 7) ``boxes`` fit, 30 to 80 m deep.
+
+        Where all cameras look ahead, forward is right and the LiDAR at the left edge, since roads are longer than wide
+        and so are pictures; else forward is up and the LiDAR in the middle.
+        """
+        ahead = bool(cameras) and all(_axis(camera)[0] > 0.5 for camera in cameras)
+        if not ahead:
+            depth, side = (float(np.clip(np.abs(boxes[:, i]).max(initial=0) + MARGIN, 30, 80)) for i in (0, 1))
+            return cls(width, height, min(height / 2 / depth, width / 2 / side), (width / 2, height / 2), "up")
+        depth = float(np.clip(boxes[:, 0].max(initial=0) + MARGIN, 30, 80))
+        right = float(np.clip(boxes[:, 1].min(initial=-MARGIN) - MARGIN, -80, 0))
+        left = float(np.clip(boxes[:, 1].max(initial=MARGIN) + MARGIN, 0, 80))
+        scale = min((width - LEFT_EDGE) / depth, height / (left - right))
+        row = left * scale + (height - (left - right) * scale) / 2
+        return cls(width, height, scale, (LEFT_EDGE, row), "right")
+
+    def pixels(self, points: FloatArray) -> FloatArray:
+        """(..., 2) pixels of (..., 2) ground positions x, y."""
+        x, y = points[..., 0] * self.pixels_per_metre, points[..., 1] * self.pixels_per_metre
+        columns, rows = (x, -y) if self.forward == "right" else (-y, -x)
+        return np.stack([self.origin[0] + columns, self.origin[1] + rows], axis=-1)
+
+
+def draw_bev(
+    points: NDArray[np.float32] | None, cameras: Sequence[Camera], scene: Scene, view: BevView
+) -> PIL.Image.Image:
+    """The scene from above.
+
+    Args:
+        points: (N, 4 or more) LiDAR points, or None.
+        cameras: whose fields of view are drawn.
+        scene: what to draw.
+        view: where and how large.
+
+    Returns:
+        RGB picture.
+    """
+    canvas = Canvas(_point_picture(points, view))
+    _draw_rings(canvas, view)
+    for camera in cameras:
+        canvas.lines(_field_of_view(camera, view), _VIEW, width=1.0)
+    if scene.truth is not None:
+        for box in scene.truth:
+            canvas.lines(_outline(box, view), TRUTH_COLOUR, width=1.0, opacity=0.85)
+    for i in scene.drawing_order:
+        colour, outline = COLOURS[scene.stages[i]], _outline(scene.boxes[i], view)
+        if scene.stages[i] == "dropped":
+            canvas.lines(outline, colour, width=1.0, opacity=0.75, dashed=True)
+        else:
+            canvas.lines(outline, colour, width=2.0)
+    for i, text in enumerate(scene.texts):
+        corners = view.pixels(bev_corners(scene.boxes[i : i + 1])[0])
+        around = [*corners.min(axis=0).tolist(), *corners.max(axis=0).tolist()]
+        shown = around[0] >= 0 and around[2] <= view.width and around[1] >= 0 and around[3] <= view.height
+        if text and shown:
+            canvas.label(around, text, COLOURS[scene.stages[i]], size=11, filled=False)
+    return canvas.image()
+
+
+def _point_picture(points: NDArray[np.float32] | None, view: BevView) -> PIL.Image.Image:
+    """Points as dots, brighter with height; the highest point of a pixel shows."""
+    picture = np.empty((view.height, view.width, 3), dtype=np.uint8)
+    picture[:] = _GROUND
+    if points is not None and len(points):
+        pixels = view.pixels(points[:, :2].astype(np.float64))
+        inside = (pixels >= 0).all(axis=1) & (pixels < [view.width, view.height]).all(axis=1)
+        columns, rows = pixels[inside].astype(np.int64).T
+        height = points[inside, 2].astype(np.float64)
+        order = np.argsort(height, kind="stable")
+        share = np.clip((height[order] - _HEIGHTS[0]) / (_HEIGHTS[1] - _HEIGHTS[0]), 0, 1)[:, None]
+        picture[rows[order], columns[order]] = (_LOW + share * (_HIGH - _LOW)).astype(np.uint8)
+    return PIL.Image.fromarray(picture)
+
+
+def _draw_rings(canvas: Canvas, view: BevView) -> None:
+    corners = np.array([[0, 0], [view.width, 0], [0, view.height], [view.width, view.height]]) - view.origin
+    farthest = float(np.hypot(*corners.T).max()) / view.pixels_per_metre
+    angles = np.linspace(0, 2 * np.pi, 181)
+    circle = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    for radius in np.arange(RING_STEP, farthest, RING_STEP):
+        ring = view.pixels(radius * circle)
+        canvas.lines(np.concatenate([ring[:-1], ring[1:]], axis=1), _RING, width=1.0, opacity=0.7)
+        canvas.text(*_ring_label(radius, view), f"{radius:.0f} m", _RING_TEXT, size=10)
+    # an arrow head where the LiDAR is, pointing forward
+    tip = np.array([[0.0, 1.0], [1.8, 0.0], [0.0, -1.0], [0.0, 1.0]]) * 6 / view.pixels_per_metre
+    arrow = view.pixels(tip)
+    canvas.lines(np.concatenate([arrow[:-1], arrow[1:]], axis=1), (220, 220, 220), width=1.5)
+
+
+def _ring_label(radius: float, view: BevView) -> tuple[float, float]:
+    """Top left pixel of a ring's label: on the lower edge where the ring gets there, else on the forward axis."""
+    pixels = radius * view.pixels_per_metre
+    if view.forward == "up":
+        return view.origin[0] + 3, view.origin[1] - pixels - 7
+    below = view.height - 9 - view.origin[1]
+    if pixels < below + 30:
+        return view.origin[0] + pixels + 3, view.origin[1] - 7
+    return view.origin[0] + float(np.sqrt(pixels**2 - below**2)) - 12, view.height - 15
+
+
+def _field_of_view(camera: Camera, view: BevView) -> FloatArray:
+    """(2, 4) lines from a camera along the left and right border of its image, on the ground plan."""
+    lidar_from_camera = np.linalg.inv(camera.camera_from_lidar)
+    inverse = np.linalg.inv(camera.intrinsics)
+    # a projection with a baseline (KITTI's P2) has its centre beside the reference camera's
+    centre = -inverse @ camera.projection[:, 3]
+    middle = camera.height / 2
+    reach = 2 * max(view.width, view.height) / view.pixels_per_metre
+    lines = []
+    for column in (0.0, float(camera.width)):
+        direction = inverse @ np.array([column, middle, 1.0])
+        ends = np.stack([centre, centre + reach * direction]) @ lidar_from_camera[:3, :3].T + lidar_from_camera[:3, 3]
+        lines.append(view.pixels(ends[:, :2]).ravel())
+    return np.array(lines)
+
+
+def _axis(camera: Camera) -> FloatArray:
+    """(3,) viewing direction of a camera in the LiDAR frame."""
+    axis: FloatArray = camera.camera_from_lidar[2, :3]
+    return axis
+
+
+def _outline(box: FloatArray, view: BevView) -> FloatArray:
+    """(5, 4) sides of a box on the ground and a tick from its centre out over its front."""
+    corners = bev_corners(box[None])[0]
+    heading = np.array([np.cos(box[YAW]), np.sin(box[YAW])])
+    tick = np.stack([box[:2], box[:2] + heading * (box[LENGTH] / 2 + 0.6)])
+    loop = view.pixels(np.concatenate([corners, corners[:1]]))
+    sides = np.concatenate([loop[:-1], loop[1:]], axis=1)
+    return np.concatenate([sides, view.pixels(tick).reshape(1, 4)])

@@ -1,0 +1,124 @@
+"""A camera's image with projected 3D boxes and 2D detections."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import PIL.Image
+from numpy.typing import NDArray
+
+from lcf3d.geometry.boxes import EDGES, box_corners
+from lcf3d.geometry.camera import NEAR, project_boxes, project_points
+from lcf3d.structures import Camera, FloatArray
+from lcf3d.visualization.canvas import Canvas
+from lcf3d.visualization.scene import CAMERA_COLOUR, COLOURS, TRUTH_COLOUR, Scene
+
+_NO_IMAGE = (40, 43, 48)
+# corners of the front face, around it (`geometry.boxes.CORNER_SIGNS`)
+_FRONT = [0, 1, 5, 4]
+
+
+def projected_edges(boxes: FloatArray, camera: Camera) -> FloatArray:
+    """(N, 12, 4) pixel segments ``x1, y1, x2, y2`` of the edges of (N, 7) boxes, cut at the near plane.
+
+    Edges wholly behind the near plane are NaN. Order: `lcf3d.geometry.boxes.EDGES`.
+    """
+    corners = box_corners(boxes)
+    homogeneous = corners @ camera.pixels_from_lidar[:, :3].T + camera.pixels_from_lidar[:, 3]
+    a, b = homogeneous[:, EDGES[:, 0]], homogeneous[:, EDGES[:, 1]]
+    depth_a, depth_b = a[..., 2] - NEAR, b[..., 2] - NEAR
+    crossing = (depth_a >= 0) != (depth_b >= 0)
+    t = np.divide(depth_a, depth_a - depth_b, out=np.zeros_like(depth_a), where=crossing)
+    cut = a + t[..., None] * (b - a)
+    start = np.where((crossing & (depth_a < 0))[..., None], cut, a)
+    end = np.where((crossing & (depth_b < 0))[..., None], cut, b)
+    behind = (depth_a < 0) & (depth_b < 0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        segments = np.concatenate([start[..., :2] / start[..., 2:], end[..., :2] / end[..., 2:]], axis=-1)
+    segments[behind] = np.nan
+    return segments
+
+
+def scaled_camera(camera: Camera, scale: float) -> Camera:
+    """The camera of the image shrunk or enlarged by ``scale``."""
+    projection = np.array(camera.projection)
+    projection[:2] *= scale
+    return replace(
+        camera, projection=projection, width=round(camera.width * scale), height=round(camera.height * scale)
+    )
+
+
+def draw_camera(
+    image: NDArray[np.uint8] | None, camera: Camera, scene: Scene, width: int | None = None, title: str = ""
+) -> PIL.Image.Image:
+    """An image with everything of the scene that the camera sees.
+
+    Args:
+        image: (H, W, 3) uint8 RGB, or None for a plain ground.
+        camera: its calibration.
+        scene: what to draw.
+        width: of the picture in pixels; that of the camera if None.
+        title: written into the upper left corner.
+
+    Returns:
+        RGB picture.
+    """
+    scale = 1.0 if width is None else width / camera.width
+    camera = scaled_camera(camera, scale)
+    if image is None:
+        background = PIL.Image.new("RGB", (camera.width, camera.height), _NO_IMAGE)
+    else:
+        background = PIL.Image.fromarray(image)
+        if background.size != (camera.width, camera.height):
+            background = background.resize((camera.width, camera.height), PIL.Image.Resampling.LANCZOS)
+    canvas = Canvas(background)
+    if title:
+        canvas.text(6, 4, title if image is not None else f"{title} (no image)", (255, 255, 255))
+    _draw_truth(canvas, camera, scene)
+    _draw_boxes(canvas, camera, scene)
+    _draw_image_boxes(canvas, camera, scene, scale)
+    return canvas.image()
+
+
+def _draw_truth(canvas: Canvas, camera: Camera, scene: Scene) -> None:
+    if scene.truth is None:
+        return
+    _, visible = project_boxes(scene.truth, camera)
+    for edges in projected_edges(scene.truth[visible], camera):
+        canvas.lines(edges, TRUTH_COLOUR, width=1.0, opacity=0.8)
+
+
+def _draw_boxes(canvas: Canvas, camera: Camera, scene: Scene) -> None:
+    """Fused boxes with a tinted front, dropped ones dashed and dim beneath them; then the labels."""
+    extents, visible = project_boxes(scene.boxes, camera)
+    edges = projected_edges(scene.boxes, camera)
+    order = [i for i in scene.drawing_order if visible[i]]
+    for i in order:
+        front, depths = project_points(box_corners(scene.boxes[i : i + 1])[0, _FRONT], camera)
+        if scene.stages[i] != "dropped" and (depths > NEAR).all():
+            canvas.polygon(front, COLOURS[scene.stages[i]], 0.16)
+    for i in order:
+        if scene.stages[i] == "dropped":
+            canvas.lines(edges[i], COLOURS["dropped"], width=1.0, opacity=0.65, dashed=True)
+        else:
+            canvas.lines(edges[i], COLOURS[scene.stages[i]], width=1.8, halo=True)
+    for i in range(len(scene.texts)):
+        if visible[i] and scene.texts[i]:
+            canvas.label(extents[i].tolist(), scene.texts[i], COLOURS[scene.stages[i]])
+
+
+def _draw_image_boxes(canvas: Canvas, camera: Camera, scene: Scene, scale: float) -> None:
+    found = scene.image_boxes.get(camera.name)
+    if found is None:
+        return
+    for box, used, text in zip(found.boxes * scale, found.used, found.texts, strict=True):
+        canvas.lines(rectangle(box), CAMERA_COLOUR, width=1.0, opacity=0.9, dashed=not used)
+        if not used:
+            canvas.label(box.tolist(), text, CAMERA_COLOUR, size=11, filled=False)
+
+
+def rectangle(box: FloatArray) -> FloatArray:
+    """(4, 4) segments around a box ``x1, y1, x2, y2``."""
+    x1, y1, x2, y2 = box
+    return np.array([[x1, y1, x2, y1], [x2, y1, x2, y2], [x2, y2, x1, y2], [x1, y2, x1, y1]])

@@ -1,0 +1,122 @@
+"""One PNG a frame: the cameras' images above, the bird's-eye view below, a legend on top. No display needed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import PIL.Image
+
+from lcf3d.formats.files import atomic_path
+from lcf3d.structures import Camera, Frame
+from lcf3d.visualization.bev import BevView, draw_bev
+from lcf3d.visualization.camera_view import draw_camera
+from lcf3d.visualization.canvas import Canvas, Colour, text_size
+from lcf3d.visualization.scene import CAMERA_COLOUR, COLOURS, TRUTH_COLOUR, Scene
+
+_BAR = (28, 31, 36)
+_TEXT = (232, 234, 237)
+_BAR_HEIGHT = 26
+GRID_COLUMNS = 3
+GRID_WIDTH = 1680
+BEV_HEIGHT = 640
+SURROUND_BEV_HEIGHT = 840
+
+
+def draw_frame(frame: Frame, scene: Scene, cameras: Sequence[str] | None = None, bev: bool = True) -> PIL.Image.Image:
+    """A frame with everything of a scene.
+
+    One camera keeps its own resolution; several are put side by side, three in a row.
+
+    Args:
+        frame: images and points; either may be missing.
+        scene: what to draw over them, see `Scene.from_fused`.
+        cameras: names of those to show; all that have an image if None, or the first one if none has.
+        bev: whether the bird's-eye view is drawn.
+
+    Returns:
+        RGB picture.
+    """
+    shown = _shown_cameras(frame, cameras)
+    panels = _camera_panels(frame, shown, scene)
+    width = max((sum(panel.width for panel in row) for row in panels), default=GRID_WIDTH)
+    rows = [_beside(row) for row in panels]
+    if bev:
+        height = BEV_HEIGHT if len(shown) < 3 else SURROUND_BEV_HEIGHT
+        everything = scene.boxes if scene.truth is None else np.concatenate([scene.boxes, scene.truth])
+        view = BevView.fit(everything, shown, width, height)
+        rows.append(draw_bev(frame.points, shown, scene, view))
+    return _stack([_legend(frame.id, scene, width), *rows])
+
+
+def save_png(picture: PIL.Image.Image, path: Path) -> None:
+    """Write a picture as PNG, whole or not at all."""
+    with atomic_path(Path(path)) as temporary:
+        picture.save(temporary, format="PNG")
+
+
+def _shown_cameras(frame: Frame, names: Sequence[str] | None) -> list[Camera]:
+    if names is not None:
+        return [frame.camera(name) for name in names]
+    with_image = [camera for camera in frame.cameras if camera.name in frame.images]
+    return with_image or list(frame.cameras[:1])
+
+
+def _camera_panels(frame: Frame, cameras: Sequence[Camera], scene: Scene) -> list[list[PIL.Image.Image]]:
+    """Pictures of the cameras, in rows."""
+    columns = min(len(cameras), GRID_COLUMNS)
+    width = None if columns < 2 else GRID_WIDTH // columns
+    panels = [
+        draw_camera(frame.images.get(camera.name), camera, scene, width, camera.name if columns > 1 else "")
+        for camera in cameras
+    ]
+    return [panels[i : i + columns] for i in range(0, len(panels), max(columns, 1))]
+
+
+def _legend(title: str, scene: Scene, width: int) -> PIL.Image.Image:
+    """A bar with the frame's id and what the colours mean, with counts; wrapped where it is too long."""
+    entries: list[tuple[str, Colour, bool]] = [
+        (f"{stage} {count}", COLOURS[stage], stage == "dropped") for stage, count in scene.counts.items()
+    ]
+    if scene.image_boxes:
+        used = sum(int(found.used.sum()) for found in scene.image_boxes.values())
+        unused = sum(len(found.used) for found in scene.image_boxes.values()) - used
+        entries.append((f"camera detection {used}", CAMERA_COLOUR, False))
+        if unused:
+            entries.append((f"camera detection without a box {unused}", CAMERA_COLOUR, True))
+    if scene.truth is not None:
+        entries.append((f"ground truth {len(scene.truth)}", TRUTH_COLOUR, False))
+    start = text_size(title, 14)[0] + 28
+    places, x, row = [], start, 0
+    for text, _, _ in entries:
+        length = 26 + text_size(text, 13)[0] + 18
+        if x + length > width and x > start:
+            x, row = start, row + 1
+        places.append((x, row))
+        x += length
+    canvas = Canvas(PIL.Image.new("RGB", (width, _BAR_HEIGHT * (row + 1)), _BAR))
+    canvas.text(8, 4, title, _TEXT, size=14)
+    for (text, colour, dashed), (left, line) in zip(entries, places, strict=True):
+        middle = _BAR_HEIGHT * (line + 0.5)
+        canvas.lines(np.array([[left, middle, left + 20.0, middle]]), colour, width=3.0, dashed=dashed)
+        canvas.text(left + 26, middle - 8, text, _TEXT, size=13)
+    return canvas.image()
+
+
+def _beside(pictures: Sequence[PIL.Image.Image]) -> PIL.Image.Image:
+    joined = PIL.Image.new("RGB", (sum(p.width for p in pictures), max(p.height for p in pictures)), _BAR)
+    x = 0
+    for picture in pictures:
+        joined.paste(picture, (x, 0))
+        x += picture.width
+    return joined
+
+
+def _stack(pictures: Sequence[PIL.Image.Image]) -> PIL.Image.Image:
+    joined = PIL.Image.new("RGB", (max(p.width for p in pictures), sum(p.height for p in pictures)), _BAR)
+    y = 0
+    for picture in pictures:
+        joined.paste(picture, (0, y))
+        y += picture.height
+    return joined

@@ -1,0 +1,129 @@
+"""What a picture shows: boxes with their stage in the fusion and a text, apart from where they came from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from lcf3d.provenance import FusedDetections, Reason, Stage
+from lcf3d.structures import BoolArray, Detections2D, Detections3D, FloatArray
+from lcf3d.visualization.canvas import Colour
+
+# Okabe and Ito's colours, told apart with any colour vision; order of the legend and, backwards, of drawing
+COLOURS: Mapping[str, Colour] = {
+    "matched": (0, 190, 135),
+    "recovered": (240, 160, 0),
+    "kept": (86, 180, 233),
+    "downweighted": (214, 130, 178),
+    "detection": (86, 180, 233),
+    "dropped": (190, 190, 190),
+}
+CAMERA_COLOUR: Colour = (240, 228, 66)
+TRUTH_COLOUR: Colour = (255, 255, 255)
+# inputs that were never candidates would only clutter the picture
+_NOT_DRAWN = (Reason.LOW_SCORE, Reason.OTHER_CLASS, Reason.TOO_MANY, Reason.INVALID)
+
+
+@dataclass(frozen=True, eq=False)
+class ImageBoxes:
+    """2D detections of one camera.
+
+    Attributes:
+        boxes: (M, 4) pixels.
+        used: (M,) whether each led to a fused detection; the others are dashed and labelled.
+        texts: (M,) labels.
+    """
+
+    boxes: FloatArray
+    used: BoolArray
+    texts: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """Everything that is drawn over the sensors' data of one frame.
+
+    Attributes:
+        boxes: (N, 7) canonical boxes.
+        stages: (N,) keys of `COLOURS`.
+        texts: (N,) labels, empty for none; earlier boxes get their labels first.
+        image_boxes: 2D detections by camera name.
+        truth: (K, 7) ground truth, or None.
+    """
+
+    boxes: FloatArray
+    stages: tuple[str, ...]
+    texts: tuple[str, ...]
+    image_boxes: Mapping[str, ImageBoxes] = field(default_factory=dict)
+    truth: FloatArray | None = None
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Number of boxes of each stage that occurs, in the order of `COLOURS`."""
+        return {stage: self.stages.count(stage) for stage in COLOURS if stage in self.stages}
+
+    @property
+    def drawing_order(self) -> list[int]:
+        """Indices of the boxes, the important ones last, so that they lie on top."""
+        rank = list(COLOURS)
+        return sorted(range(len(self.stages)), key=lambda i: (-rank.index(self.stages[i]), -i))
+
+    @classmethod
+    def from_detections(
+        cls,
+        detections: Detections3D,
+        camera: Mapping[str, Detections2D] | None = None,
+        truth: Detections3D | None = None,
+    ) -> Scene:
+        """Detections that went through no fusion."""
+        return cls(
+            detections.boxes,
+            ("detection",) * len(detections),
+            _texts(detections),
+            {
+                name: ImageBoxes(found.boxes, np.ones(len(found), dtype=bool), _texts(found))
+                for name, found in (camera or {}).items()
+            },
+            None if truth is None else truth.boxes,
+        )
+
+    @classmethod
+    def from_fused(cls, fused: FusedDetections, truth: Detections3D | None = None) -> Scene:
+        """Outputs of a fusion in the colour of their stage, and the inputs that were dropped on the way."""
+        stages = [Stage(stage).name.lower() for stage in fused.stages]
+        lowered = fused.lidar.output[fused.lidar.reason == Reason.DOWNWEIGHTED]
+        for output in lowered[lowered >= 0]:
+            stages[output] = "downweighted"
+        dropped = fused.dropped_lidar
+        dropped = dropped[~np.isin(fused.lidar.reason[dropped], _NOT_DRAWN)]
+        return cls(
+            np.concatenate([fused.detections.boxes, fused.lidar_inputs.boxes[dropped]]),
+            (*stages, *("dropped",) * len(dropped)),
+            (*_texts(fused.detections), *("",) * len(dropped)),
+            _image_boxes(fused),
+            None if truth is None else truth.boxes,
+        )
+
+
+def _image_boxes(fused: FusedDetections) -> dict[str, ImageBoxes]:
+    """The 2D detections that took part, with the reason where they led to nothing."""
+    result = {}
+    for c, (name, found) in enumerate(zip(fused.camera_names, fused.camera_inputs, strict=True)):
+        rows = np.flatnonzero((fused.camera.camera == c) & ~np.isin(fused.camera.reason, _NOT_DRAWN))
+        chosen = found[fused.camera.detection[rows]]
+        used = fused.camera.stage[rows] != Stage.DROPPED
+        texts = [
+            text if ok else f"{text} {Reason(reason).name.lower().replace('_', ' ')}"
+            for text, ok, reason in zip(_texts(chosen), used, fused.camera.reason[rows], strict=True)
+        ]
+        result[name] = ImageBoxes(chosen.boxes, used, tuple(texts))
+    return result
+
+
+def _texts(detections: Detections2D | Detections3D) -> tuple[str, ...]:
+    return tuple(
+        f"{detections.class_names[label]} {score:.2f}"
+        for label, score in zip(detections.labels, detections.scores, strict=True)
+    )
