@@ -14,6 +14,7 @@ from lcf3d.errors import ConfigError
 
 if TYPE_CHECKING:
     from rich.console import Console
+    from rich.table import Table
 
     from lcf3d.evaluation.kitti import KittiEvaluationConfig, KittiEvaluator, KittiMetrics
     from lcf3d.evaluation.kitti_breakdown import ComparisonRow
@@ -78,6 +79,8 @@ def eval_kitti(
         return
     if compare:
         _print_comparison(console, rows, names, samples)
+        for sentence in _covered_by_one(evaluators, names):
+            console.print(sentence, soft_wrap=True)
     else:
         _print_metrics(console, evaluators[0].metrics())
     if out is not None:
@@ -206,17 +209,30 @@ def _nds_hat(
     if json_:
         typer.echo(json.dumps(content, indent=2))
         return
-    console.print(f"NDS^ {100 * content['nds_hat']:.2f}, mAP {100 * content['mean_ap']:.2f} at matching distances")
-    for name, value in content["tp_errors"].items():
-        console.print(f"{name}: {value:.3f}")
+    console.print(_nds_hat_table(content, len(cameras)))
+
+
+def _nds_hat_table(content: dict[str, Any], n_frames: int) -> Table:
+    from rich.table import Table
+
+    caption = f"NDS^ {100 * content['nds_hat']:.2f}, {n_frames} frames\nAP in percent; errors in m, 1 - IoU, rad"
+    table = Table(title="NDS^ on KITTI", box=None, padding=(0, 2, 0, 0), caption=caption, caption_justify="left")
+    table.add_column("class", no_wrap=True)
+    for name in ("AP", "ATE", "ASE", "AOE"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for name, ap in content["mean_dist_aps"].items():
+        errors = content["label_tp_errors"][name].values()
+        table.add_row(name, f"{100 * ap:.2f}", *(f"{error:.3f}" for error in errors))
+    means = content["tp_errors"].values()
+    table.add_row("mean", f"{100 * content['mean_ap']:.2f}", *(f"{error:.3f}" for error in means), style="bold")
+    return table
 
 
 def _print_metrics(console: Console, metrics: KittiMetrics) -> None:
     """The table of all measures for people."""
     from rich.table import Table
 
-    from lcf3d.evaluation.kitti import DIFFICULTIES
-    from lcf3d.evaluation.report import MEASURE_NAMES
+    from lcf3d.evaluation.kitti import DIFFICULTIES, MEASURE_NAMES
 
     table = Table(title=f"KITTI, {metrics.frame_count} frames, AP in percent", box=None, padding=(0, 2, 0, 0))
     for name in ("class", "", "IoU"):
@@ -236,7 +252,7 @@ def _print_metrics(console: Console, metrics: KittiMetrics) -> None:
             table.add_row(class_name if first else "", MEASURE_NAMES[measure], f"{threshold:g}", *values)
     console.print(table)
     for sentence in _remarks(metrics):
-        console.print(sentence)
+        console.print(sentence, soft_wrap=True)
 
 
 def _remarks(metrics: KittiMetrics) -> list[str]:
@@ -258,7 +274,7 @@ def _print_comparison(console: Console, rows: Sequence[ComparisonRow], names: Se
     """Two result sets side by side for people."""
     from rich.table import Table
 
-    from lcf3d.evaluation.report import MEASURE_NAMES
+    from lcf3d.evaluation.kitti import MEASURE_NAMES
 
     table = Table(title="AP (R40) in percent", box=None, padding=(0, 2, 0, 0))
     for name in ("class", "", ""):
@@ -279,8 +295,24 @@ def _print_comparison(console: Console, rows: Sequence[ComparisonRow], names: Se
             f"{row.difference.low:+.2f} to {row.difference.high:+.2f}",
         )
     console.print(table)
-    if not rows:
-        console.print("the two have no class and measure in common")
     console.print(
-        f"intervals: {samples} resamples of the frames, the same for both; coloured where they leave out zero"
+        f"intervals: {samples} resamples of the frames, the same for both; coloured where they leave out zero",
+        soft_wrap=True,
     )
+
+
+def _covered_by_one(evaluators: Sequence[KittiEvaluator], names: Sequence[str]) -> list[str]:
+    """What cannot be compared, one sentence for each of the two result sets."""
+    from lcf3d.evaluation.kitti import MEASURE_NAMES
+
+    sentences = []
+    for own, other, name in zip(evaluators, reversed(evaluators), names, strict=True):
+        alone = [
+            f"{class_name} {MEASURE_NAMES[measure]}"
+            for class_name, measures in own.covered.items()
+            for measure in measures
+            if measure not in other.covered[class_name]
+        ]
+        if alone:
+            sentences.append(f"only in {name}: {', '.join(alone)}")
+    return sentences

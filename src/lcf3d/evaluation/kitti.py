@@ -23,6 +23,7 @@ from lcf3d.structures import FloatArray, IntArray
 
 DIFFICULTIES = ("easy", "moderate", "hard")
 MEASURES = ("bbox", "aos", "bev", "3d")
+MEASURE_NAMES = {"bbox": "2D", "aos": "AOS", "bev": "BEV", "3d": "3D"}
 
 # every class that KITTI annotates; results may hold them, though only three are evaluated
 KNOWN_CLASSES = (

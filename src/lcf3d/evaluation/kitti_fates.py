@@ -70,7 +70,7 @@ class FusionFates:
         dropped_wrongly: dropped LiDAR detections of an object that is now missed, by the fusion's reason.
         dropped_rightly: dropped LiDAR detections of no object, or of one that is reported anyway, by reason.
         misses: missed objects: ``dropped`` by the fusion, ``below_threshold`` (reported with a lower score), or
-            ``not_proposed`` (no LiDAR detection fits, no output).
+            ``not_proposed`` (no LiDAR detection and no output overlaps it enough).
     """
 
     class_name: str

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from html import escape
 
-from lcf3d.evaluation.kitti import DIFFICULTIES
+from lcf3d.evaluation.kitti import DIFFICULTIES, MEASURE_NAMES
 from lcf3d.evaluation.kitti_breakdown import IOU_THRESHOLDS, ComparisonRow
 from lcf3d.evaluation.kitti_study import ClassStudy, KittiStudy
 from lcf3d.evaluation.svg import PALETTE, Line, line_chart
@@ -19,13 +19,11 @@ th, td { padding: .2em .8em; border-bottom: 1px solid #e2e8f0; text-align: right
 th:first-child, td:first-child, td.text { text-align: left; }
 .plots { display: flex; flex-wrap: wrap; gap: 1.5em; } figure { margin: 0; } figcaption { font-weight: 600; }
 .note { color: #475569; max-width: 46em; } .good { color: #047857; } .bad { color: #b91c1c; }
-.frame { display: flex; flex-wrap: wrap; gap: 1em; align-items: flex-start; }
-.picture { width: 100%; max-width: 1040px; }
+.picture { display: block; width: 1040px; max-width: 100%; margin-bottom: .5em; }
 .key span { display: inline-block; margin-right: 1.2em; } .key i { display: inline-block; width: 1em; height: .7em;
   border: 2px solid; margin-right: .4em; }
 """
 
-MEASURE_NAMES = {"bbox": "2D", "aos": "AOS", "bev": "BEV", "3d": "3D"}
 _FATE_COLUMNS = ("matched", "recovered", "downweighted", "kept", "unknown")
 
 
@@ -50,14 +48,15 @@ def html_report(
         parts += ["<h2>Side by side</h2>", _comparison_table(comparison, [study.name for study in studies])]
     parts += ["<h2>AP over the IoU threshold, and precision over recall</h2>", _plots(studies)]
     if any(part.distance for part in main.classes):
-        parts += ["<h2>By distance</h2>", *(_distance_table(study, studies) for study in studies)]
+        parts += ["<h2>By distance</h2>", *(_distance_table(study, studies) for study in studies), _DISTANCE_NOTE]
     parts += ["<h2>At the best F1</h2>", *(_fate_table(study, studies) for study in studies)]
     fused = [study for study in studies if any(part.fusion for part in study.classes)]
     if fused:
         parts += ["<h2>What the fusion did</h2>", *(_fusion_tables(study, studies) for study in fused)]
     if pictures:
         parts += [f"<h2>Worst frames{_of(main, studies)}</h2>", _KEY]
-        parts += [f"<h3>{escape(heading)}</h3><div class='frame'>{body}</div>" for heading, body in pictures.items()]
+        frames = (f"<div><h3>{escape(heading)}</h3>{body}</div>" for heading, body in pictures.items())
+        parts += [f"<div class='plots'>{''.join(frames)}</div>"]
     return (
         f"<!doctype html><html lang='en'><head><meta charset='utf-8'><title>{escape(title)}</title>"
         f"<meta name='viewport' content='width=device-width'><style>{_STYLE}</style></head><body>"
@@ -66,6 +65,9 @@ def html_report(
     )
 
 
+_DISTANCE_NOTE = (
+    "<p class='note'>In brackets the number of objects; with fewer than 41 the official sampling cannot reach 100.</p>"
+)
 FATE_COLORS = {"right": "#2563eb", "wrong": "#dc2626", "missed": "#d97706", "found": "#16a34a", "ignored": "#94a3b8"}
 _KEY = (
     "<p class='key'>"
@@ -174,8 +176,7 @@ def _distance_table(study: KittiStudy, studies: Sequence[KittiStudy]) -> str:
     header = ["class" + _of(study, studies)]
     header += [f"{near:g} m and more" if far == float("inf") else f"{near:g} to {far:g} m" for near, far in ranges]
     rows = [[part.selection.class_name, *(f"{row.ap:.2f} ({row.objects})" for row in part.distance)] for part in parts]
-    note = "In brackets the number of objects; with fewer than 41 the official sampling cannot reach 100."
-    return _table(header, rows, raw=True) + f"<p class='note'>{note}</p>"
+    return _table(header, rows, raw=True)
 
 
 def _fate_table(study: KittiStudy, studies: Sequence[KittiStudy]) -> str:
@@ -208,7 +209,9 @@ def _fusion_tables(study: KittiStudy, studies: Sequence[KittiStudy]) -> str:
         + f"<p class='note'>{note}</p>"
         + _table(["reported detections", "", *used], outputs)
         + _table(["dropped LiDAR detections", "reason", "rightly", "wrongly"], dropped)
-        + _table(["missed objects", "dropped by the fusion", "reported with a lower score", "never proposed"], misses)
+        + _table(
+            ["missed objects", "dropped by the fusion", "reported with a lower score", "no detection fits"], misses
+        )
     )
 
 
@@ -237,7 +240,9 @@ def _ratio(part: int, whole: int) -> str:
 
 
 def _table(header: Sequence[str], rows: Sequence[Sequence[str]], raw: bool = False) -> str:
-    """An HTML table; ``raw`` cells are HTML already."""
+    """An HTML table, nothing without rows; ``raw`` cells are HTML already."""
+    if not rows:
+        return ""
 
     def cell(text: str) -> str:
         return text if raw else escape(text)
