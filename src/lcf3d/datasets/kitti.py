@@ -253,6 +253,11 @@ class KittiDataset(Sequence[Frame]):
         """The calibration of a frame."""
         return read_calibration(self.folder / "calib" / f"{frame_id}.txt")
 
+    def image_paths(self, frame_id: str) -> dict[str, Path]:
+        """The image files of a frame that are there, by camera name."""
+        found = {name: self._present[folder].get(frame_id) for name, folder, _ in CAMERAS}
+        return {name: path for name, path in found.items() if path is not None}
+
     def frame(self, frame_id: str) -> Frame:
         """The frame of that id; scan, images and labels are read when first asked for.
 
@@ -261,14 +266,13 @@ class KittiDataset(Sequence[Frame]):
             FormatError: its calibration is malformed.
         """
         calibration = self.calibration(frame_id)
-        cameras, images = [], {}
-        for name, folder, projection in CAMERAS:
+        cameras, images = [], self.image_paths(frame_id)
+        for name, _, projection in CAMERAS:
             if projection not in calibration.projections:
                 continue
-            path = self._present[folder].get(frame_id)
+            path = images.get(name)
             matrix = calibration.projections[projection]
             if path:
-                images[name] = path
                 width, height = image_size(path)
                 _check_image_size(path, (width, height), matrix)
             else:
