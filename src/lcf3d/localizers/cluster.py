@@ -86,8 +86,7 @@ def image_height_score(reach, ground, height, projection, image_size, box2d):  #
 def range_profile(reaches, weights, window, planes, height, projection, image_size, box2d, profile):  # type: ignore[no-untyped-def]
     """Score of every range bin as the place where the object's near surface is (numba).
 
-    The score is the weight of the points within the object's depth behind the bin, less some of what lies just in
-    front of it (an object begins where its points begin), times `image_height_score`.
+    The score is the weight of the points within ``window`` from the bin on, times `image_height_score`.
 
     Args:
         reaches: (N,) ranges in metres.
@@ -109,15 +108,13 @@ def range_profile(reaches, weights, window, planes, height, projection, image_si
         profile[b] = 0.0
         if histogram[b] == 0.0:
             continue
-        inside = before = 0.0
+        inside = 0.0
         for s in range(min(span, BINS - b)):
             inside += histogram[b + s]
-        for s in range(1, min(span, b + 1)):
-            before += histogram[b - s]
         reach = (b + 0.5) * BIN
         s = station_of(reach)
         prior = image_height_score(reach, planes[s, 0] + planes[s, 1] * reach, height, projection, image_size, box2d)
-        profile[b] = (inside - 0.3 * min(before, inside)) * prior
+        profile[b] = inside * prior
 
 
 @njit(cache=True, nogil=True)

@@ -6,11 +6,11 @@ A fit has seven parameters: x, y, lift over the ground plane, length, width, hei
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
+
+from lcf3d.localizers.ground import ordered
 
 PARAMETERS = 7
 X, Y, LIFT, LENGTH, WIDTH, HEIGHT, YAW = range(PARAMETERS)
@@ -39,67 +39,56 @@ PIXEL_DEVIATION = 1.0
 LIFT_DEVIATION = 0.1
 
 
-class Evidence(NamedTuple):
-    """What a fit has to agree with; arrays are float64, lengths in metres, in the frustum frame.
-
-    Attributes:
-        points: (N, 3) x, y and weight of the cluster.
-        strength: weight of the points beside the other terms.
-        ground: (3,) a, b, c of the plane z = a + b x + c y.
-        projection: (3, 4) pixels from the frustum frame.
-        image_size: (2,) width and height in pixels.
-        box2d: (4,) pixels.
-        edge_sigma: (2,) deviation of the 2D box's vertical and horizontal edges in pixels.
-        mean: (3,) length, width, height of the class.
-        deviation: (3,) their deviations.
-        solid: whether beams stop at the sides of the body.
-    """
-
-    points: NDArray[np.float64]
-    strength: float
-    ground: NDArray[np.float64]
-    projection: NDArray[np.float64]
-    image_size: NDArray[np.float64]
-    box2d: NDArray[np.float64]
-    edge_sigma: NDArray[np.float64]
-    mean: NDArray[np.float64]
-    deviation: NDArray[np.float64]
-    solid: bool
+# What a fit has to agree with beside the points, in one array of numbers (numba compiles that fastest), each at its
+# place; lengths in metres, in the frustum frame:
+STRENGTH = 0  # weight of the points beside the other terms
+GROUND = 1  # a, b, c of the plane z = a + b x + c y
+PROJECTION = 4  # the 12 numbers, row by row, of pixels from the frustum frame
+IMAGE_SIZE = 16  # width, height
+BOX2D = 18  # x1, y1, x2, y2
+EDGE_SIGMA = 22  # deviation of the 2D box's vertical and of its horizontal edges in pixels
+MEAN = 24  # length, width, height of the class
+DEVIATION = 27  # their deviations
+SOLID = 30  # 1 where beams stop at the sides of the body
+EVIDENCE = 31
 
 
 @njit(cache=True, nogil=True)
 def image_cost(q, evidence):  # type: ignore[no-untyped-def]
-    """Squares (linear beyond two sigma) of the distances of the projection's edges, clipped to the image, to the 2D box's."""
-    ground, projection, box2d = evidence.ground, evidence.projection, evidence.box2d
+    """How far the edges of the projection, clipped to the image, are from those of the 2D box (numba).
+
+    Squares in units of one sigma, linear beyond two, over the four edges.
+    """
+    p, box2d = evidence[PROJECTION:IMAGE_SIZE], evidence[BOX2D:EDGE_SIGMA]
     cos, sin = math.cos(q[YAW]), math.sin(q[YAW])
-    bottom = ground[0] + ground[1] * q[X] + ground[2] * q[Y] + q[LIFT]
+    bottom = evidence[GROUND] + evidence[GROUND + 1] * q[X] + evidence[GROUND + 2] * q[Y] + q[LIFT]
     x1 = y1 = 1e9
     x2 = y2 = -1e9
     for c in range(4):
         along = 0.5 * q[LENGTH] if c < 2 else -0.5 * q[LENGTH]
         across = 0.5 * q[WIDTH] if c % 2 == 0 else -0.5 * q[WIDTH]
         x, y = q[X] + cos * along - sin * across, q[Y] + sin * along + cos * across
-        u = projection[0, 0] * x + projection[0, 1] * y + projection[0, 2] * bottom + projection[0, 3]
-        v = projection[1, 0] * x + projection[1, 1] * y + projection[1, 2] * bottom + projection[1, 3]
-        w = projection[2, 0] * x + projection[2, 1] * y + projection[2, 2] * bottom + projection[2, 3]
+        u = p[0] * x + p[1] * y + p[2] * bottom + p[3]
+        v = p[4] * x + p[5] * y + p[6] * bottom + p[7]
+        w = p[8] * x + p[9] * y + p[10] * bottom + p[11]
         for top in range(2):
             if top == 1:
-                u += projection[0, 2] * q[HEIGHT]
-                v += projection[1, 2] * q[HEIGHT]
-                w += projection[2, 2] * q[HEIGHT]
+                u += p[2] * q[HEIGHT]
+                v += p[6] * q[HEIGHT]
+                w += p[10] * q[HEIGHT]
             # a corner behind the camera ends far outside the image, on its side
             depth = max(w, 0.1)
             x1, x2 = min(x1, u / depth), max(x2, u / depth)
             y1, y2 = min(y1, v / depth), max(y2, v / depth)
-    width, height = evidence.image_size[0], evidence.image_size[1]
-    across_sigma, down_sigma = evidence.edge_sigma[0], evidence.edge_sigma[1]
+    width, height = evidence[IMAGE_SIZE], evidence[IMAGE_SIZE + 1]
+    across_sigma, down_sigma = evidence[EDGE_SIGMA], evidence[EDGE_SIGMA + 1]
     total = _robust((min(max(x1, 0.0), width) - box2d[0]) / across_sigma)
     total += _robust((min(max(x2, 0.0), width) - box2d[2]) / across_sigma)
     total += _robust((min(max(y1, 0.0), height) - box2d[1]) / down_sigma)
     return total + _robust((min(max(y2, 0.0), height) - box2d[3]) / down_sigma)
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True)
 def _robust(off):  # type: ignore[no-untyped-def]
     return off * off if abs(off) < 2.0 else 4.0 * abs(off) - 4.0
 
@@ -159,27 +148,27 @@ def open_cost(q, points):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def energy(q, evidence):  # type: ignore[no-untyped-def]
+def energy(q, points, evidence):  # type: ignore[no-untyped-def]
     """What a good fit makes small: disagreement with points, 2D box, class sizes and ground (numba)."""
-    surface = solid_cost(q, evidence.points) if evidence.solid else open_cost(q, evidence.points)
-    total = evidence.strength * surface + 0.5 * image_cost(q, evidence)
+    surface = solid_cost(q, points) if evidence[SOLID] > 0.0 else open_cost(q, points)
+    total = evidence[STRENGTH] * surface + 0.5 * image_cost(q, evidence)
     for i in range(3):
-        off = (q[LENGTH + i] - evidence.mean[i]) / evidence.deviation[i]
+        off = (q[LENGTH + i] - evidence[MEAN + i]) / evidence[DEVIATION + i]
         total += 0.5 * off * off
     off = q[LIFT] / LIFT_DEVIATION
     return total + 0.5 * min(off * off, 9.0)
 
 
 @njit(cache=True, nogil=True)
-def refine(q, rounds, evidence):  # type: ignore[no-untyped-def]
+def refine(q, rounds, points, evidence):  # type: ignore[no-untyped-def]
     """Pattern search, one parameter after the other, from ``q`` (changed in place); returns the energy reached."""
     step = np.empty(PARAMETERS)
     step[X], step[Y], step[LIFT], step[YAW] = 0.3, 0.2, 0.05, 0.12
-    if not evidence.solid:
+    if evidence[SOLID] == 0.0:
         step[X], step[Y], step[YAW] = 0.1, 0.1, 0.2
     for i in range(3):
-        step[LENGTH + i] = 0.5 * evidence.deviation[i]
-    best = energy(q, evidence)
+        step[LENGTH + i] = 0.5 * evidence[DEVIATION + i]
+    best = energy(q, points, evidence)
     for _ in range(rounds):
         for i in range(PARAMETERS):
             kept = q[i]
@@ -187,7 +176,7 @@ def refine(q, rounds, evidence):  # type: ignore[no-untyped-def]
                 q[i] = kept + step[i]
                 if LENGTH <= i <= HEIGHT:
                     q[i] = max(q[i], 0.1)
-                value = energy(q, evidence)
+                value = energy(q, points, evidence)
                 if value < best:
                     break
                 step[i] = -step[i]
@@ -201,49 +190,50 @@ def refine(q, rounds, evidence):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def search(near, evidence):  # type: ignore[no-untyped-def]
+def search(points, evidence):  # type: ignore[no-untyped-def]
     """The best box for the evidence (numba).
 
-    All yaws over half a turn are tried at their likeliest places: on the near corner of the points (the closeness
-    criterion then is the energy's first term) and centred on the frustum's axis behind the range ``near``. The best
-    few are refined a little, the best one of these to the end.
+    Yaws over half a turn are tried, a solid body with its near sides on the outermost points (the energy's first term
+    is the closeness criterion then), an open one around the middle of the points. The best few are refined a little,
+    the best one of these to the end.
+
+    Args:
+        points: (N, 3) x, y and weight of the cluster.
+        evidence: (`EVIDENCE`,) what else the fit has to agree with.
 
     Returns:
         (7,) parameters and the energy.
     """
-    points = evidence.points
     energies, starts = np.full(STARTS, np.inf), np.empty((STARTS, PARAMETERS))
     q = np.zeros(PARAMETERS)
-    q[LENGTH : HEIGHT + 1] = evidence.mean
+    for i in range(3):
+        q[LENGTH + i] = evidence[MEAN + i]
     us, vs = np.empty(len(points)), np.empty(len(points))
-    middle_x, middle_y = np.median(points[:, 0]), np.median(points[:, 1])
+    half = len(points) // 2
+    middle_x, middle_y = ordered(points[:, 0])[half], ordered(points[:, 1])[half]
     for t in range(YAWS):
         q[YAW] = math.pi * t / YAWS
         cos, sin = math.cos(q[YAW]), math.sin(q[YAW])
-        if not evidence.solid:
-            q[X], q[Y] = middle_x + SHIFT, middle_y
-            _keep_best(energies, starts, energy(q, evidence), q)
-            continue
-        for i in range(len(points)):
-            us[i], vs[i] = points[i, 0] * cos + points[i, 1] * sin, points[i, 1] * cos - points[i, 0] * sin
-        u, v = _completed_centre(us, q[LENGTH]), _completed_centre(vs, q[WIDTH])
-        q[X], q[Y] = u * cos - v * sin, u * sin + v * cos
-        _keep_best(energies, starts, energy(q, evidence), q)
-        depth = 0.5 * (abs(cos) * q[LENGTH] + abs(sin) * q[WIDTH])
-        for share in (0.8, 1.1):
-            q[X], q[Y] = near + share * depth, 0.0
-            _keep_best(energies, starts, energy(q, evidence), q)
+        q[X], q[Y] = middle_x + SHIFT, middle_y
+        if evidence[SOLID] > 0.0:
+            for i in range(len(points)):
+                us[i], vs[i] = points[i, 0] * cos + points[i, 1] * sin, points[i, 1] * cos - points[i, 0] * sin
+            u, v = _completed_centre(us, q[LENGTH]), _completed_centre(vs, q[WIDTH])
+            q[X], q[Y] = u * cos - v * sin, u * sin + v * cos
+        _keep_best(energies, starts, energy(q, points, evidence), q)
+    best = 0
     for k in range(STARTS):
         if energies[k] < np.inf:
-            energies[k] = refine(starts[k], FIRST_ROUNDS, evidence)
-    best = np.argmin(energies)
-    return starts[best], refine(starts[best], LAST_ROUNDS, evidence)
+            energies[k] = refine(starts[k], FIRST_ROUNDS, points, evidence)
+        if energies[k] < energies[best]:
+            best = k
+    return starts[best], refine(starts[best], LAST_ROUNDS, points, evidence)
 
 
 @njit(cache=True, nogil=True)
 def _completed_centre(values, size):  # type: ignore[no-untyped-def]
     """Centre along one axis of a body of known size whose near side is seen; the third outermost points bound it."""
-    order = np.sort(values)
+    order = ordered(values)
     trim = min(2, (len(order) - 1) // 4)
     low, high = order[trim], order[len(order) - 1 - trim]
     if high - low > size or low < 0.0 < high:
@@ -253,10 +243,10 @@ def _completed_centre(values, size):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _keep_best(energies, starts, value, q):  # type: ignore[no-untyped-def]
-    """Enter ``q`` among the best starts, of which no two have the same yaw."""
-    place = np.argmax(energies)
+    """Enter ``q`` among the best starts."""
+    place = 0
     for k in range(len(energies)):
-        if energies[k] < np.inf and starts[k, YAW] == q[YAW]:
+        if energies[k] > energies[place]:
             place = k
     if value < energies[place]:
         energies[place] = value

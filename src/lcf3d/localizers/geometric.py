@@ -15,15 +15,24 @@ from lcf3d.fusion.frustum import FrustumProposals
 from lcf3d.geometry.boxes import wrap_angle
 from lcf3d.localizers.cluster import BIN, BINS, GAP_PER_METRE, MOST_POINTS, range_profile, take_cluster, weigh_points
 from lcf3d.localizers.fit import (
+    BOX2D,
+    DEVIATION,
     EDGE_DEVIATION,
+    EDGE_SIGMA,
+    EVIDENCE,
     FULL_COUNT,
+    GROUND,
     HEIGHT,
+    IMAGE_SIZE,
     LIFT,
+    MEAN,
     OPEN_STRENGTH,
     PIXEL_DEVIATION,
+    PROJECTION,
+    SOLID,
     SOLID_STRENGTH,
+    STRENGTH,
     YAW,
-    Evidence,
     X,
     Y,
     image_cost,
@@ -44,6 +53,8 @@ SECOND_SHARE = 0.1
 SCORE_COST = 2.0
 # an object of unknown class is taken as solid from this width on, in metres
 SOLID_WIDTH = 1.2
+# spread of its size
+UNKNOWN_DEVIATION = 0.3
 # a point off the instance mask counts this share of one on it, so that a bad mask does not lose the object
 OFF_MASK = 0.1
 
@@ -127,71 +138,83 @@ def _localize_all(  # type: ignore[no-untyped-def]
     points, gaussian, offsets, axis_yaw, boxes2d, projections, image_sizes, rows, grid, boxes, quality
 ):
     """Fill ``boxes`` (K, 7) and ``quality`` (K,) for all proposals of a frame."""
-    around = np.empty(3)
+    around, planes, evidence = np.empty(3), np.empty((STATIONS, 3)), np.empty(EVIDENCE)
     fit_plane(grid, 0.0, 0.0, 20.0, np.nan, around)
-    planes, profile = np.empty((STATIONS, 3)), np.empty(BINS)
-    taken = np.empty((MOST_POINTS, 3))
     for k in range(len(offsets) - 1):
         part, weight = points[offsets[k] : offsets[k + 1]], gaussian[offsets[k] : offsets[k + 1]]
-        row, projection, box2d, image_size = rows[k], projections[k], boxes2d[k], image_sizes[k]
         expected = around[0]
         if np.isnan(expected):
             # nothing was hit around the sensor: let the lowest point stand on the ground
-            expected = np.nanmin(part[:, 2])
+            expected = np.inf
+            for i in range(len(part)):
+                if part[i, 2] < expected:
+                    expected = part[i, 2]
         ground_along(grid, axis_yaw[k], expected, planes)
-        reaches, weights = np.empty(len(part)), np.empty(len(part))
-        weigh_points(part, weight, planes, row[2], reaches, weights)
-        diagonal = math.hypot(row[0], row[1])
-        window = 0.5 if np.isnan(diagonal) else (0.25 if row[6] > 0.0 else 0.5) * diagonal
-        range_profile(reaches, weights, window, planes, row[2], projection, image_size, box2d, profile)
-        first, best = profile.max(), np.inf
-        for _ in range(CLUSTERS):
-            peak = np.argmax(profile)
-            score = profile[peak]
-            if score <= SECOND_SHARE * first:
-                break
-            near = peak * BIN
-            plane = planes[station_of(near)]
-            mean, deviation, solid, edge = _size(row, near, plane, projection, box2d)
-            reach = math.hypot(mean[0], mean[1])
-            gap = (0.25 * reach if solid else 0.3) + GAP_PER_METRE * near
-            used, count = take_cluster(part, reaches, weights, near - 0.25 * reach, near + 1.4 * reach, gap, taken)
-            if used >= FEWEST_POINTS:
-                strength = (SOLID_STRENGTH if solid else OPEN_STRENGTH) * min(1.0, count / FULL_COUNT)
-                sigma = np.empty(2)
-                sigma[0] = math.hypot(PIXEL_DEVIATION, edge * (box2d[2] - box2d[0]))
-                sigma[1] = math.hypot(PIXEL_DEVIATION, EDGE_DEVIATION * (box2d[3] - box2d[1]))
-                evidence = Evidence(
-                    taken[:used], strength, plane, projection, image_size, box2d, sigma, mean, deviation, solid
-                )
-                q, value = search(near, evidence)
-                value += SCORE_COST * math.log(first / score)
-                if value < best:
-                    best = value
-                    boxes[k] = q
-                    boxes[k, 2] = plane[0] + plane[1] * q[X] + plane[2] * q[Y] + q[LIFT] + 0.5 * q[HEIGHT]
-                    quality[k] = _quality(q, evidence, count)
-            hidden = int(max(window, 1.0) / BIN)
-            profile[max(peak - hidden, 0) : peak + hidden + 1] = 0.0
+        evidence[PROJECTION:IMAGE_SIZE] = projections[k].ravel()
+        evidence[IMAGE_SIZE:BOX2D], evidence[BOX2D:EDGE_SIGMA] = image_sizes[k], boxes2d[k]
+        quality[k] = _localize_one(part, weight, rows[k], planes, projections[k], evidence, boxes[k])
 
 
 @njit(cache=True, nogil=True)
-def _size(row, near, plane, projection, box2d):  # type: ignore[no-untyped-def]
-    """Mean and deviation of length, width, height, whether solid, and edge deviation, of a class or of a 2D box."""
-    mean, deviation = row[0:3].copy(), row[3:6].copy()
-    if not np.isnan(mean[0]):
-        return mean, deviation, row[6] > 0.0, row[7]
-    ground = plane[0] + plane[1] * near
-    depth = max(projection[2, 0] * near + projection[2, 2] * ground + projection[2, 3], 0.5)
-    across = abs(projection[0, 1]) / depth
-    down = abs(projection[1, 2]) / depth
-    mean[:] = max((box2d[2] - box2d[0]) / across, 0.2)
-    mean[2] = max((box2d[3] - box2d[1]) / down, 0.2)
-    deviation[:] = 0.3 * mean
-    return mean, deviation, mean[1] > SOLID_WIDTH, EDGE_DEVIATION
+def _localize_one(points, gaussian, row, planes, projection, evidence, box):  # type: ignore[no-untyped-def]
+    """Fill ``box`` (7,) with the best fit to any of the proposal's depth clusters; returns its quality."""
+    reaches, weights, profile = np.empty(len(points)), np.empty(len(points)), np.empty(BINS)
+    taken = np.empty((MOST_POINTS, 3))
+    weigh_points(points, gaussian, planes, row[2], reaches, weights)
+    diagonal = math.hypot(row[0], row[1])
+    window = 0.5 if np.isnan(diagonal) else (0.25 if row[6] > 0.0 else 0.5) * diagonal
+    image_size, box2d = evidence[IMAGE_SIZE:BOX2D], evidence[BOX2D:EDGE_SIGMA]
+    range_profile(reaches, weights, window, planes, row[2], projection, image_size, box2d, profile)
+    first, best, quality = profile[np.argmax(profile)], np.inf, 0.0
+    for _ in range(CLUSTERS):
+        peak = np.argmax(profile)
+        score = profile[peak]
+        if score <= SECOND_SHARE * first:
+            break
+        near = peak * BIN
+        plane = planes[station_of(near)]
+        solid = _set_size(row, near, plane, projection, evidence)
+        reach = math.hypot(evidence[MEAN], evidence[MEAN + 1])
+        gap = (0.25 * reach if solid else 0.3) + GAP_PER_METRE * near
+        used, count = take_cluster(points, reaches, weights, near - 0.25 * reach, near + 1.4 * reach, gap, taken)
+        if used >= FEWEST_POINTS:
+            evidence[STRENGTH] = (SOLID_STRENGTH if solid else OPEN_STRENGTH) * min(1.0, count / FULL_COUNT)
+            evidence[GROUND:PROJECTION] = plane
+            q, value = search(taken[:used], evidence)
+            value += SCORE_COST * math.log(first / score)
+            if value < best:
+                best = value
+                box[:] = q
+                box[2] = plane[0] + plane[1] * q[X] + plane[2] * q[Y] + q[LIFT] + 0.5 * q[HEIGHT]
+                quality = _quality(q, taken[:used], evidence, count)
+        hidden = int(max(window, 1.0) / BIN)
+        profile[max(peak - hidden, 0) : peak + hidden + 1] = 0.0
+    return quality
 
 
 @njit(cache=True, nogil=True)
-def _quality(q, evidence, count):  # type: ignore[no-untyped-def]
-    surface = solid_cost(q, evidence.points) if evidence.solid else open_cost(q, evidence.points)
+def _set_size(row, near, plane, projection, evidence):  # type: ignore[no-untyped-def]
+    """Enter the sizes of the class, or of the 2D box at that range if unknown; returns whether the body is solid."""
+    wide, tall = evidence[BOX2D + 2] - evidence[BOX2D], evidence[BOX2D + 3] - evidence[BOX2D + 1]
+    edge, solid = row[7], row[6] > 0.0
+    for i in range(3):
+        evidence[MEAN + i], evidence[DEVIATION + i] = row[i], row[3 + i]
+    if np.isnan(row[0]):
+        foot = plane[0] + plane[1] * near
+        depth = max(projection[2, 0] * near + projection[2, 2] * foot + projection[2, 3], 0.5)
+        across = math.hypot(projection[0, 1], projection[1, 1]) / depth
+        evidence[MEAN] = evidence[MEAN + 1] = max(wide / across, 0.2)
+        evidence[MEAN + 2] = max(tall / across, 0.2)
+        for i in range(3):
+            evidence[DEVIATION + i] = UNKNOWN_DEVIATION * evidence[MEAN + i]
+        edge, solid = EDGE_DEVIATION, evidence[MEAN] > SOLID_WIDTH
+    evidence[EDGE_SIGMA] = math.hypot(PIXEL_DEVIATION, edge * wide)
+    evidence[EDGE_SIGMA + 1] = math.hypot(PIXEL_DEVIATION, EDGE_DEVIATION * tall)
+    evidence[SOLID] = 1.0 if solid else 0.0
+    return solid
+
+
+@njit(cache=True, nogil=True)
+def _quality(q, points, evidence, count):  # type: ignore[no-untyped-def]
+    surface = solid_cost(q, points) if evidence[SOLID] > 0.0 else open_cost(q, points)
     return (1.0 - surface) * math.exp(-0.1 * image_cost(q, evidence)) * math.sqrt(min(1.0, count / FULL_COUNT))

@@ -22,6 +22,19 @@ STATION_STEP = 1.5
 
 
 @njit(cache=True, nogil=True)
+def ordered(values):  # type: ignore[no-untyped-def]
+    """A sorted copy of a short array (numba); one compiled sort serves all of the localizer."""
+    result = values.copy()
+    for i in range(1, len(result)):
+        value, j = result[i], i - 1
+        while j >= 0 and result[j] > value:
+            result[j + 1] = result[j]
+            j -= 1
+        result[j + 1] = value
+    return result
+
+
+@njit(cache=True, nogil=True)
 def lowest_returns(cloud):  # type: ignore[no-untyped-def]
     """Lowest height in each cell of a grid around the sensor (numba).
 
@@ -72,7 +85,7 @@ def fit_plane(grid, x, y, radius, expected, plane):  # type: ignore[no-untyped-d
     plane[0], plane[1], plane[2] = expected, 0.0, 0.0
     if n == 0:
         return
-    level = np.sort(cells[:n, 2])[n // 4]
+    level = ordered(cells[:n, 2])[n // 4]
     # a quarter of the cells lower than a plausible slope allows: only walls and objects were hit
     if not level > expected + 0.5 + 0.1 * radius:
         plane[0] = level
@@ -133,7 +146,7 @@ def ground_along(grid, yaw, expected, planes):  # type: ignore[no-untyped-def]
         planes[s, 0] = plane[0] - planes[s, 1] * reach
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True)
 def station_of(reach):  # type: ignore[no-untyped-def]
     """Row of `ground_along` for a range in metres."""
     steps = math.log(max(reach, FIRST_STATION) / FIRST_STATION) / math.log(STATION_STEP)
