@@ -12,9 +12,11 @@ from lcf3d.errors import Lcf3dError
 # verb -> module of lcf3d.cli that defines a function of that name; heavy imports stay inside the functions
 VERBS: dict[str, str] = {
     "run": "run",
+    "view": "view",
     "eval": "eval",
     "config": "config",
     "check": "check",
+    "bench": "bench",
 }
 
 app = typer.Typer(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 import PIL.Image
@@ -23,51 +22,50 @@ _VIEW = (110, 118, 128)
 _HEIGHTS = (-2.0, 2.0)
 _LOW, _HIGH = np.array([58.0, 66.0, 82.0]), np.array([165.0, 178.0, 190.0])
 RING_STEP = 10.0
-# metres around the outermost box centres, and pixels left of the LiDAR where forward is right
-MARGIN, LEFT_EDGE = 6.0, 24.0
+# metres: around the outermost box centres; behind the LiDAR where cameras only look ahead; most in any direction
+MARGIN, BEHIND, FARTHEST = 6.0, 2.0, 80.0
 
 
 @dataclass(frozen=True)
 class BevView:
-    """Which part of the ground a picture shows, and at what scale.
+    """Which part of the ground a picture shows, and at what scale. Forward (x) is right, left (y) is up.
 
     Attributes:
         width: of the picture in pixels.
         height: of the picture in pixels.
         pixels_per_metre: scale.
         origin: pixel (column, row) of the LiDAR.
-        forward: where x points, ``right`` or ``up``.
     """
 
     width: int
     height: int
     pixels_per_metre: float
     origin: tuple[float, float]
-    forward: Literal["right", "up"] = "up"
 
     @classmethod
     def fit(cls, boxes: FloatArray, cameras: Sequence[Camera], width: int, height: int) -> BevView:
-        """A view in which (N, 7) ``boxes`` fit, 30 to 80 m deep.
+        """A view in which (N, 7) ``boxes`` fit, up to `FARTHEST` metres.
 
-        Where all cameras look ahead, forward is right and the LiDAR at the left edge, since roads are longer than wide
-        and so are pictures; else forward is up and the LiDAR in the middle.
+        The LiDAR is near the left edge where all cameras look ahead, else where the boxes leave it.
         """
-        ahead = bool(cameras) and all(_axis(camera)[0] > 0.5 for camera in cameras)
-        if not ahead:
-            depth, side = (float(np.clip(np.abs(boxes[:, i]).max(initial=0) + MARGIN, 30, 80)) for i in (0, 1))
-            return cls(width, height, min(height / 2 / depth, width / 2 / side), (width / 2, height / 2), "up")
-        depth = float(np.clip(boxes[:, 0].max(initial=0) + MARGIN, 30, 80))
-        right = float(np.clip(boxes[:, 1].min(initial=-MARGIN) - MARGIN, -80, 0))
-        left = float(np.clip(boxes[:, 1].max(initial=MARGIN) + MARGIN, 0, 80))
-        scale = min((width - LEFT_EDGE) / depth, height / (left - right))
-        row = left * scale + (height - (left - right) * scale) / 2
-        return cls(width, height, scale, (LEFT_EDGE, row), "right")
+        ahead = bool(cameras) and all(camera.camera_from_lidar[2, 0] > 0.5 for camera in cameras)
+        low = boxes[:, :2].min(axis=0, initial=0) - MARGIN
+        high = boxes[:, :2].max(axis=0, initial=0) + MARGIN
+        low = np.clip(low, -FARTHEST, [-BEHIND if ahead else -15, -10])
+        high = np.clip(high, [30, 10], FARTHEST)
+        if ahead:
+            low[0] = -BEHIND
+        scale = float(min(np.array([width, height]) / (high - low)))
+        # what a side has too much is shared by both ends, but ahead goes to the front
+        spare = np.array([width, height]) - scale * (high - low)
+        column = -low[0] * scale + (0 if ahead else spare[0] / 2)
+        return cls(width, height, scale, (float(column), float(high[1] * scale + spare[1] / 2)))
 
     def pixels(self, points: FloatArray) -> FloatArray:
         """(..., 2) pixels of (..., 2) ground positions x, y."""
-        x, y = points[..., 0] * self.pixels_per_metre, points[..., 1] * self.pixels_per_metre
-        columns, rows = (x, -y) if self.forward == "right" else (-y, -x)
-        return np.stack([self.origin[0] + columns, self.origin[1] + rows], axis=-1)
+        columns = self.origin[0] + points[..., 0] * self.pixels_per_metre
+        rows = self.origin[1] - points[..., 1] * self.pixels_per_metre
+        return np.stack([columns, rows], axis=-1)
 
 
 def draw_bev(
@@ -139,8 +137,6 @@ def _draw_rings(canvas: Canvas, view: BevView) -> None:
 def _ring_label(radius: float, view: BevView) -> tuple[float, float]:
     """Top left pixel of a ring's label: on the lower edge where the ring gets there, else on the forward axis."""
     pixels = radius * view.pixels_per_metre
-    if view.forward == "up":
-        return view.origin[0] + 3, view.origin[1] - pixels - 7
     below = view.height - 9 - view.origin[1]
     if pixels < below + 30:
         return view.origin[0] + pixels + 3, view.origin[1] - 7
@@ -161,12 +157,6 @@ def _field_of_view(camera: Camera, view: BevView) -> FloatArray:
         ends = np.stack([centre, centre + reach * direction]) @ lidar_from_camera[:3, :3].T + lidar_from_camera[:3, 3]
         lines.append(view.pixels(ends[:, :2]).ravel())
     return np.array(lines)
-
-
-def _axis(camera: Camera) -> FloatArray:
-    """(3,) viewing direction of a camera in the LiDAR frame."""
-    axis: FloatArray = camera.camera_from_lidar[2, :3]
-    return axis
 
 
 def _outline(box: FloatArray, view: BevView) -> FloatArray:

@@ -14,6 +14,8 @@ from lcf3d.structures import Camera, FloatArray
 from lcf3d.visualization.canvas import Canvas
 from lcf3d.visualization.scene import CAMERA_COLOUR, COLOURS, TRUTH_COLOUR, Scene
 
+# pixels: height of the least thing with a label, and width up to which a picture has smaller labels
+LEAST_LABELLED, SMALL_PANEL = 14.0, 700
 _NO_IMAGE = (40, 43, 48)
 # corners of the front face, around it (`geometry.boxes.CORNER_SIGNS`)
 _FRONT = [0, 1, 5, 4]
@@ -74,7 +76,7 @@ def draw_camera(
             background = background.resize((camera.width, camera.height), PIL.Image.Resampling.LANCZOS)
     canvas = Canvas(background)
     if title:
-        canvas.text(6, 4, title if image is not None else f"{title} (no image)", (255, 255, 255))
+        canvas.text(6, 4, title if image is not None else f"{title} (no image)", (255, 255, 255), plate=True)
     _draw_truth(canvas, camera, scene)
     _draw_boxes(canvas, camera, scene)
     _draw_image_boxes(canvas, camera, scene, scale)
@@ -103,9 +105,10 @@ def _draw_boxes(canvas: Canvas, camera: Camera, scene: Scene) -> None:
             canvas.lines(edges[i], COLOURS["dropped"], width=1.0, opacity=0.65, dashed=True)
         else:
             canvas.lines(edges[i], COLOURS[scene.stages[i]], width=1.8, halo=True)
+    size = 12.0 if canvas.width > SMALL_PANEL else 10.0
     for i in range(len(scene.texts)):
-        if visible[i] and scene.texts[i]:
-            canvas.label(extents[i].tolist(), scene.texts[i], COLOURS[scene.stages[i]])
+        if visible[i] and scene.texts[i] and _is_legible(extents[i]):
+            canvas.label(extents[i].tolist(), scene.texts[i], COLOURS[scene.stages[i]], size)
 
 
 def _draw_image_boxes(canvas: Canvas, camera: Camera, scene: Scene, scale: float) -> None:
@@ -114,8 +117,13 @@ def _draw_image_boxes(canvas: Canvas, camera: Camera, scene: Scene, scale: float
         return
     for box, used, text in zip(found.boxes * scale, found.used, found.texts, strict=True):
         canvas.lines(rectangle(box), CAMERA_COLOUR, width=1.0, opacity=0.9, dashed=not used)
-        if not used:
-            canvas.label(box.tolist(), text, CAMERA_COLOUR, size=11, filled=False)
+        if not used and _is_legible(box):
+            canvas.label(box.tolist(), text, CAMERA_COLOUR, size=10, filled=False)
+
+
+def _is_legible(extent: FloatArray) -> bool:
+    """Whether something is tall enough for a label; around smaller things labels hide more than they say."""
+    return bool(extent[3] - extent[1] >= LEAST_LABELLED)
 
 
 def rectangle(box: FloatArray) -> FloatArray:

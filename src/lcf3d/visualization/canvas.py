@@ -118,8 +118,6 @@ class Canvas:
             (x2, y1),
             (x1 - width, y1),
             (x1, y1),
-            (x1, y1 - 2 * height),
-            (x1, y2 + height),
         ):
             place = (round(x), round(y), round(x) + width, round(y) + height)
             inside = place[0] >= 0 and place[1] >= 0 and place[2] <= self.width and place[3] <= self.height
@@ -129,11 +127,11 @@ class Canvas:
                 return True
         return False
 
-    def text(self, x: float, y: float, text: str, colour: Colour, size: float = 12.0) -> None:
-        """Plain text with its top left corner at a place; later labels keep away from it."""
+    def text(self, x: float, y: float, text: str, colour: Colour, size: float = 12.0, plate: bool = False) -> None:
+        """Text with its top left corner at a place, on a dark ``plate`` or none; later labels keep away from it."""
         width, height = text_size(text, size)
         place = (round(x) - _LABEL_PADDING, round(y), round(x) + width + _LABEL_PADDING, round(y) + height)
-        self._labels.append(_Label(place, text, colour, None, size))
+        self._labels.append(_Label(place, text, colour, (*_HALO, 150) if plate else None, size))
 
     def image(self) -> PIL.Image.Image:
         """The finished RGB picture."""
