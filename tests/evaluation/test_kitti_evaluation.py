@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.evaluation.kitti_frames import dontcare, frames
 
 from lcf3d.errors import ConfigError, DatasetError, FormatError
 from lcf3d.evaluation.curves import precision_curve
@@ -20,6 +19,7 @@ from lcf3d.evaluation.kitti import (
     split_frame_ids,
 )
 from lcf3d.formats.kitti import KittiFrames, KittiObjects, format_objects, read_folder, read_frame_ids
+from tests.evaluation.kitti_frames import dontcare, frames
 
 CLASSES = ("Car", "Pedestrian", "Cyclist")
 
@@ -112,6 +112,14 @@ def test_only_what_the_results_cover_is_evaluated() -> None:
     assert list(metrics.to_json()["Car"]) == ["bbox"]
 
 
+def test_an_alpha_that_is_the_same_everywhere_is_no_orientation() -> None:
+    truth = [[{"alpha": i / 41}] for i in range(41)]
+    assert "aos" not in evaluate(frames(truth, False), frames(many(41), True)).measures("Car")
+    # unless the objects have but one alpha too, or there are too few detections to tell
+    assert "aos" in evaluate(frames(many(41), False), frames(many(41), True)).measures("Car")
+    assert "aos" in evaluate(frames(truth[:40], False), frames(many(40), True)).measures("Car")
+
+
 def test_class_names_ignore_case() -> None:
     metrics = evaluate(frames(many(41), False), frames(many(41, name="car"), True))
     assert metrics.ap("Car", "bbox", "easy") == 100
@@ -125,6 +133,7 @@ def test_distance_range_ignores_what_is_outside() -> None:
     for i in range(41):
         results[i][0]["rotation"] = np.pi / 2  # wrong in 3D, but only far away
     evaluator = KittiEvaluator(frames(truth, False), frames(results, True))
+
     def ap(near: float, far: float) -> float:
         curve, _ = precision_curve(evaluator.events(Selection("Car", "3d", "easy", (near, far))))
         assert curve.object_count == 41
@@ -209,6 +218,7 @@ def test_golden_values_of_the_official_program(shared: Path, dataset: str, name:
     assert set(ours) == set(golden)
     compared = 0
     for class_name, measures in golden.items():
+        assert set(ours[class_name]) == set(measures)
         for measure, difficulties in measures.items():
             for difficulty, expected in difficulties.items():
                 got = ours[class_name][measure][difficulty]

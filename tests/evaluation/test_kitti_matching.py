@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tests.evaluation.kitti_frames import dontcare, frames
 from shapely import affinity
 from shapely.geometry import Polygon, box
 
@@ -14,6 +13,7 @@ from lcf3d.evaluation.curves import precision_curve
 from lcf3d.evaluation.kitti import DIFFICULTIES, KittiEvaluator, Selection
 from lcf3d.evaluation.kitti_matching import BELOW, FALSE_POSITIVE, NOT_JUDGED, TRUE_POSITIVE
 from lcf3d.formats.kitti import KittiObjects
+from tests.evaluation.kitti_frames import dontcare, frames
 
 
 def rectangle(objects: KittiObjects, i: int) -> Polygon:
