@@ -86,7 +86,12 @@ def metrics_table(metrics: NuscenesMetrics, title: str, nds_hat: bool = False) -
     errors = 3 if nds_hat else len(_ERROR_TITLES)
     # eleven columns have to fit into 80 characters
     table = Table(
-        title=title, caption=_caption(metrics, nds_hat), caption_justify="left", box=None, padding=(0, 1, 0, 0)
+        title=title,
+        caption=_caption(metrics, nds_hat),
+        caption_justify="left",
+        box=None,
+        padding=(0, 1, 0, 0),
+        pad_edge=False,
     )
     table.add_column("class", no_wrap=True)
     for heading in ("AP", *(f"{th:g}m" for th in config.dist_ths), *_ERROR_TITLES[:errors]):

@@ -14,7 +14,7 @@ from lcf3d.errors import FormatError
 from lcf3d.formats.files import write_text
 from lcf3d.formats.json_stream import JsonCursor
 from lcf3d.formats.nuscenes_boxes import NUSCENES_ATTRIBUTES, GlobalBoxes
-from lcf3d.structures import NUSCENES_CLASSES
+from lcf3d.structures import NUSCENES_CLASSES, BoolArray, FloatArray
 
 MAX_BOXES_PER_SAMPLE = 500
 """The most boxes that the nuScenes benchmark accepts for one sample."""
@@ -83,7 +83,7 @@ def write_submission(path: Path, boxes: GlobalBoxes, meta: Mapping[str, Any] | N
         FormatError: a coordinate, size or score is not a finite number.
     """
     for name in ("translations", "sizes", "rotations", "scores"):
-        bad = ~np.isfinite(getattr(boxes, name).reshape(len(boxes), -1)).all(axis=1)
+        bad = _not_finite(getattr(boxes, name))
         if bad.any():
             token = boxes.sample_tokens[boxes.samples[np.flatnonzero(bad)[0]]]
             raise FormatError(f"cannot write {path}: {name} of a box of sample {token} hold NaN or infinite values")
@@ -136,6 +136,8 @@ def _read_sample(path: Path, token: str, boxes: Any, max_boxes: int) -> dict[str
                 raise FormatError(f"{path}: sample {token} holds a box of unknown {key} {name!r}; known are {known}")
     except KeyError as error:
         raise FormatError(f"{path}: a box of sample {token} has no {error.args[0]!r}") from None
+    except TypeError:
+        raise FormatError(f"{path}: {key} of a box of sample {token} must be text") from None
     if any(box.get("sample_token", token) != token for box in boxes):
         raise FormatError(f"{path}: a box listed under sample {token} carries another sample's token")
     return arrays
@@ -148,11 +150,7 @@ def _join(path: Path, tokens: list[str], parts: list[dict[str, Any]]) -> GlobalB
         key: np.concatenate([part[key] for part in parts] + [np.zeros((0, *shape))]) for key, shape in _NUMBERS.items()
     }
     # a velocity may be unknown (NaN); nothing else may
-    checks = [
-        (f"{key} that is NaN or infinite", ~np.isfinite(joined[key].reshape(len(samples), -1)).all(axis=1))
-        for key in _NUMBERS
-        if key != "velocity"
-    ]
+    checks = [(f"{key} that is NaN or infinite", _not_finite(joined[key])) for key in _NUMBERS if key != "velocity"]
     checks.append(("size that is not positive", (joined["size"] <= 0).any(axis=1)))
     checks.append(("rotation that is zero", (joined["rotation"] == 0).all(axis=1)))
     for what, bad in checks:
@@ -175,3 +173,9 @@ def _join(path: Path, tokens: list[str], parts: list[dict[str, Any]]) -> GlobalB
         attributes,
         np.full(len(samples), -1, dtype=np.int64),
     )
+
+
+def _not_finite(values: FloatArray) -> BoolArray:
+    """(N,) whether a row of ``values`` (N,) or (N, K) holds NaN or infinite numbers."""
+    columns = values[:, None] if values.ndim == 1 else values
+    return np.asarray(~np.isfinite(columns).all(axis=1), dtype=np.bool_)
