@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 from numba import njit
 
-from lcf3d.geometry.iou import pair_bev_iou
+from lcf3d.geometry.iou import turned_intersection
 from lcf3d.structures import FloatArray, IntArray
 
 Clustering = Literal["cliques", "components", "nms"]
@@ -81,6 +81,7 @@ def _links(boxes, labels, iou_threshold, class_aware):  # type: ignore[no-untype
     Boxes are sorted into square cells as wide as the largest box, so that only nine cells need a look.
     """
     n = len(boxes)
+    cos, sin = np.cos(boxes[:, 6]), np.sin(boxes[:, 6])
     reach = 0.0
     for i in range(n):
         reach = max(reach, math.hypot(boxes[i, 3], boxes[i, 4]))
@@ -109,7 +110,21 @@ def _links(boxes, labels, iou_threshold, class_aware):  # type: ignore[no-untype
                 # the IoU cannot exceed the ratio of the areas
                 if min(area, other) <= iou_threshold * max(area, other):
                     continue
-                if pair_bev_iou(boxes[i], boxes[j]) > iou_threshold:
+                shared = turned_intersection(
+                    boxes[i, 0],
+                    boxes[i, 1],
+                    boxes[i, 3],
+                    boxes[i, 4],
+                    cos[i],
+                    sin[i],
+                    boxes[j, 0],
+                    boxes[j, 1],
+                    boxes[j, 3],
+                    boxes[j, 4],
+                    cos[j],
+                    sin[j],
+                )
+                if shared > iou_threshold * (area + other - shared):
                     if links == len(neighbours):
                         neighbours = np.concatenate((neighbours, np.empty(links, np.int64)))
                     neighbours[links] = j

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -12,9 +12,23 @@ from numpy.typing import NDArray
 
 from lcf3d.geometry.boxes import YAW, wrap_angle
 from lcf3d.geometry.camera import NEAR
-from lcf3d.structures import Camera, Detections2D, FloatArray, IntArray
+from lcf3d.structures import BoolArray, Camera, Detections2D, FloatArray, IntArray
 
 MaskMode = Literal["box", "mask", "box+mask"]
+
+
+class SecondViews(NamedTuple):
+    """The other 2D boxes of proposals that two views of one object make (paper section 4.2.3).
+
+    Attributes:
+        camera: (K,) index of the second camera, -1 for proposals of a single view.
+        detection: (K,) index of the 2D detection in that camera's detections, or -1.
+        boxes2d: (K, 4) its pixel box, NaN for proposals of a single view.
+    """
+
+    camera: IntArray
+    detection: IntArray
+    boxes2d: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,7 +40,8 @@ class FrustumProposals:
 
     Attributes:
         points: (M, C) float32 ``x, y, z, intensity, ...``, x y z in each proposal's frustum frame.
-        gaussian: (M,) float32 the Gaussian mask G of the paper, 1 at the centre of the 2D box.
+        gaussian: (M,) float32 the Gaussian mask G of the paper, 1 at the centre of the 2D box; of two views the larger
+            value.
         mask: (M,) float32, 1 for points on the instance mask; None unless the mode is ``box+mask``.
         offsets: (K + 1,) where each proposal's points begin.
         axis_yaw: (K,) heading of each frustum's axis in the LiDAR frame.
@@ -38,6 +53,7 @@ class FrustumProposals:
         class_names: the class list of ``labels``.
         cameras: the cameras of the frame.
         cloud: (N, C) the whole scan in the LiDAR frame, for what needs the surroundings (such as the ground).
+        second: the second views of stereo proposals; None where all have a single view.
     """
 
     points: NDArray[np.float32]
@@ -53,6 +69,7 @@ class FrustumProposals:
     class_names: tuple[str, ...]
     cameras: tuple[Camera, ...]
     cloud: NDArray[np.float32]
+    second: SecondViews | None = None
 
     def __len__(self) -> int:
         return len(self.offsets) - 1
@@ -93,46 +110,55 @@ def points_in_image_boxes(points, projection, near, boxes):  # type: ignore[no-u
     Returns:
         (P,) point indices ordered by box then point, (P, 2) their pixels, (K + 1,) where each box's points begin.
     """
-    count = np.zeros(len(boxes) + 1, np.int64)
-    hit_point = np.empty(1024, np.int64)
-    hit_box = np.empty(1024, np.int64)
-    hit_pixel = np.empty((1024, 2))
-    hits = 0
+    candidates, pixels = _project_into(points, projection, near, boxes)
+    offsets = np.zeros(len(boxes) + 1, np.int64)
+    for k in range(len(boxes)):
+        inside = 0
+        for n in range(len(candidates)):
+            u, v = pixels[n, 0], pixels[n, 1]
+            inside += (boxes[k, 0] <= u) & (u <= boxes[k, 2]) & (boxes[k, 1] <= v) & (v <= boxes[k, 3])
+        offsets[k + 1] = offsets[k] + inside
+    index = np.empty(offsets[-1], np.int64)
+    at_pixels = np.empty((offsets[-1], 2))
+    for k in range(len(boxes)):
+        at = offsets[k]
+        for n in range(len(candidates)):
+            u, v = pixels[n, 0], pixels[n, 1]
+            if boxes[k, 0] <= u <= boxes[k, 2] and boxes[k, 1] <= v <= boxes[k, 3]:
+                index[at], at_pixels[at, 0], at_pixels[at, 1] = candidates[n], u, v
+                at += 1
+    return index, at_pixels, offsets
+
+
+@njit(cache=True, nogil=True)
+def _project_into(points, projection, near, boxes):  # type: ignore[no-untyped-def]
+    """Indices and pixels of the points in the rectangle around all boxes.
+
+    One pass over the scan without branches or divisions: it is the most expensive step of recovery.
+    """
+    a0, a1, a2, a3 = projection[0, 0], projection[0, 1], projection[0, 2], projection[0, 3]
+    b0, b1, b2, b3 = projection[1, 0], projection[1, 1], projection[1, 2], projection[1, 3]
+    c0, c1, c2, c3 = projection[2, 0], projection[2, 1], projection[2, 2], projection[2, 3]
     u1, v1, u2, v2 = np.inf, np.inf, -np.inf, -np.inf
     for k in range(len(boxes)):
         u1, v1 = min(u1, boxes[k, 0]), min(v1, boxes[k, 1])
         u2, v2 = max(u2, boxes[k, 2]), max(v2, boxes[k, 3])
+    found = np.empty(len(points) + 1, np.int64)
+    count = 0
     for n in range(len(points)):
-        x, y, z = points[n, 0], points[n, 1], points[n, 2]
-        w = projection[2, 0] * x + projection[2, 1] * y + projection[2, 2] * z + projection[2, 3]
-        if not w > near:
-            continue
-        u = (projection[0, 0] * x + projection[0, 1] * y + projection[0, 2] * z + projection[0, 3]) / w
-        if not (u1 <= u <= u2):
-            continue
-        v = (projection[1, 0] * x + projection[1, 1] * y + projection[1, 2] * z + projection[1, 3]) / w
-        if not (v1 <= v <= v2):
-            continue
-        for k in range(len(boxes)):
-            if boxes[k, 0] <= u <= boxes[k, 2] and boxes[k, 1] <= v <= boxes[k, 3]:
-                if hits == len(hit_point):
-                    hit_point = np.concatenate((hit_point, np.empty(hits, np.int64)))
-                    hit_box = np.concatenate((hit_box, np.empty(hits, np.int64)))
-                    hit_pixel = np.concatenate((hit_pixel, np.empty((hits, 2))))
-                hit_point[hits], hit_box[hits] = n, k
-                hit_pixel[hits, 0], hit_pixel[hits, 1] = u, v
-                count[k + 1] += 1
-                hits += 1
-    offsets = np.cumsum(count)
-    cursor = offsets.copy()
-    index = np.empty(hits, np.int64)
-    pixels = np.empty((hits, 2))
-    for i in range(hits):
-        at = cursor[hit_box[i]]
-        index[at] = hit_point[i]
-        pixels[at] = hit_pixel[i]
-        cursor[hit_box[i]] += 1
-    return index, pixels, offsets
+        x, y, z = np.float64(points[n, 0]), np.float64(points[n, 1]), np.float64(points[n, 2])
+        w = c0 * x + c1 * y + c2 * z + c3
+        u = a0 * x + a1 * y + a2 * z + a3
+        v = b0 * x + b1 * y + b2 * z + b3
+        found[count] = n
+        count += (w > near) & (u >= u1 * w) & (u <= u2 * w) & (v >= v1 * w) & (v <= v2 * w)
+    pixels = np.empty((count, 2))
+    for i in range(count):
+        x, y, z = points[found[i], 0], points[found[i], 1], points[found[i], 2]
+        w = c0 * x + c1 * y + c2 * z + c3
+        pixels[i, 0] = (a0 * x + a1 * y + a2 * z + a3) / w
+        pixels[i, 1] = (b0 * x + b1 * y + b2 * z + b3) / w
+    return found[:count], pixels
 
 
 def enlarge_boxes(boxes: FloatArray, enlargement: float) -> FloatArray:
@@ -168,6 +194,7 @@ def extract_frustums(
     enlargement: float = 0.05,
     min_points: int = 10,
     mask_mode: MaskMode = "box",
+    pairs: IntArray | None = None,
 ) -> FrustumProposals:
     """Frustum proposals of the selected 2D detections of all cameras, those with too few points left out.
 
@@ -180,7 +207,10 @@ def extract_frustums(
         min_points: ``p_min``, fewest points of a proposal.
         mask_mode: ``box`` takes all points in the box; ``mask`` only those on the instance mask, or the box where the
             mask keeps fewer than ``min_points``; ``box+mask`` takes the box and marks the points on the mask.
+        pairs: (P, 4) stereo pairs ``camera, detection, second camera, second detection``: a selected detection that
+            is the first of a pair gives the points that lie in both boxes (paper section 4.2.3), or on both masks.
     """
+    second = {} if pairs is None else {(c, d): (c2, d2) for c, d, c2, d2 in pairs.tolist()}
     parts: list[tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]] = []
     rows: list[tuple[int, int, float]] = []
     for c, (camera, found, chosen) in enumerate(zip(cameras, detections, selected, strict=True)):
@@ -193,17 +223,33 @@ def extract_frustums(
         yaws = axis_yaws(boxes, camera)
         for k, d in enumerate(chosen):
             inside, at = index[offsets[k] : offsets[k + 1]], pixels[offsets[k] : offsets[k + 1]]
-            on_mask = np.ones(len(inside), dtype=bool)
-            instance = found.masks[d] if found.masks is not None else None
-            if mask_mode != "box" and instance is not None:
-                on_mask = instance.contains(at)
-                if mask_mode == "mask" and on_mask.sum() >= min_points:
-                    inside, at, on_mask = inside[on_mask], at[on_mask], on_mask[on_mask]
+            weight = gaussian_mask(at, boxes[k])
+            on_mask = _on_mask(found, int(d), at, mask_mode)
+            other = second.get((c, int(d)))
+            if other is not None:
+                view, found2, d2 = cameras[other[0]], detections[other[0]], other[1]
+                both, at2, _ = points_in_image_boxes(
+                    points[inside],
+                    np.array(view.pixels_from_lidar),
+                    NEAR,
+                    enlarge_boxes(found2.boxes[[d2]], enlargement),
+                )
+                on_mask = on_mask[both] & _on_mask(found2, d2, at2, mask_mode)
+                inside, weight = inside[both], np.maximum(weight[both], gaussian_mask(at2, found2.boxes[d2]))
+            if mask_mode == "mask" and on_mask.sum() >= min_points:
+                inside, weight, on_mask = inside[on_mask], weight[on_mask], on_mask[on_mask]
             if len(inside) >= min_points:
-                turned = _turn(points[inside], -yaws[k])
-                parts.append((turned, gaussian_mask(at, boxes[k]), on_mask.astype(np.float32)))
+                parts.append((_turn(points[inside], -yaws[k]), weight, on_mask.astype(np.float32)))
                 rows.append((c, int(d), float(yaws[k])))
-    return _assemble(points, cameras, detections, parts, rows, mask_mode)
+    return _assemble(points, cameras, detections, parts, rows, second, mask_mode)
+
+
+def _on_mask(found: Detections2D, detection: int, pixels: FloatArray, mask_mode: MaskMode) -> BoolArray:
+    """(N,) whether pixels fall on a detection's instance mask; all do where there is none or none is wanted."""
+    instance = found.masks[detection] if found.masks is not None else None
+    if mask_mode == "box" or instance is None:
+        return np.ones(len(pixels), dtype=bool)
+    return instance.contains(pixels)
 
 
 def _turn(points: NDArray[np.float32], angle: float) -> NDArray[np.float32]:
@@ -221,6 +267,7 @@ def _assemble(
     detections: Sequence[Detections2D],
     parts: list[tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]],
     rows: list[tuple[int, int, float]],
+    second: Mapping[tuple[int, int], tuple[int, int]],
     mask_mode: MaskMode,
 ) -> FrustumProposals:
     """The proposals' parts laid one after the other."""
@@ -242,4 +289,12 @@ def _assemble(
         class_names=detections[0].class_names if detections else (),
         cameras=tuple(cameras),
         cloud=points,
+        second=_second_views(detections, [second.get((c, d), (-1, -1)) for c, d, _ in rows]) if second else None,
     )
+
+
+def _second_views(detections: Sequence[Detections2D], rows: list[tuple[int, int]]) -> SecondViews:
+    """Camera and detection of each proposal's second view with its box; -1 for none."""
+    boxes = [detections[c].boxes[d] if c >= 0 else np.full(4, np.nan) for c, d in rows]
+    index = np.array(rows, dtype=np.int64).reshape(-1, 2)
+    return SecondViews(index[:, 0], index[:, 1], np.array(boxes).reshape(-1, 4))

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
+from numba import njit
 
 from lcf3d.fusion.clustering import Clusters
 from lcf3d.geometry.camera import project_boxes
@@ -57,12 +58,26 @@ def cluster_iou(projected: FloatArray, visible: BoolArray, clusters: Clusters, b
         boxes2d: (M, 4) camera detections.
     """
     result = np.zeros((len(clusters), len(boxes2d)))
-    members = np.flatnonzero(visible & (clusters.index >= 0))
-    if len(members) and len(boxes2d):
-        members = members[np.argsort(clusters.index[members], kind="stable")]
-        numbers, first = np.unique(clusters.index[members], return_index=True)
-        result[numbers] = np.maximum.reduceat(image_iou(projected[members], boxes2d), first, axis=0)
+    _fill_cluster_iou(projected, visible, clusters.index, np.array(boxes2d, dtype=np.float64), result)
     return result
+
+
+@njit(cache=True, nogil=True)
+def _fill_cluster_iou(projected, visible, cluster_of_box, boxes2d, result):  # type: ignore[no-untyped-def]
+    """Raise ``result`` (C, M) to the IoU of each visible member of each cluster with each 2D box."""
+    for i in range(len(projected)):
+        if not visible[i] or cluster_of_box[i] < 0:
+            continue
+        x1, y1, x2, y2 = projected[i, 0], projected[i, 1], projected[i, 2], projected[i, 3]
+        area = (x2 - x1) * (y2 - y1)
+        for m in range(len(boxes2d)):
+            width = min(x2, boxes2d[m, 2]) - max(x1, boxes2d[m, 0])
+            height = min(y2, boxes2d[m, 3]) - max(y1, boxes2d[m, 1])
+            if width > 0.0 and height > 0.0:
+                shared = width * height
+                union = area + (boxes2d[m, 2] - boxes2d[m, 0]) * (boxes2d[m, 3] - boxes2d[m, 1]) - shared
+                c = cluster_of_box[i]
+                result[c, m] = max(result[c, m], shared / union)
 
 
 def assign(iou: FloatArray, iou_threshold: float, method: Assignment = "gated") -> IntArray:

@@ -61,15 +61,14 @@ def _clipped_edge_integral(xa, ya, xb, yb, half_length, half_width):  # type: ig
 
 
 @njit(cache=True, nogil=True)
-def bev_intersection(ax, ay, a_length, a_width, a_yaw, bx, by, b_length, b_width, b_yaw):  # type: ignore[no-untyped-def]
-    """Area that two rotated rectangles share (scalars; numba)."""
+def turned_intersection(ax, ay, a_length, a_width, cos_a, sin_a, bx, by, b_length, b_width, cos_b, sin_b):  # type: ignore[no-untyped-def]
+    """Area that two rotated rectangles share, from cosine and sine of their yaws (scalars; numba)."""
     dx, dy = bx - ax, by - ay
     reach = 0.5 * (math.hypot(a_length, a_width) + math.hypot(b_length, b_width))
     if dx * dx + dy * dy >= reach * reach:
         return 0.0
-    cos_a, sin_a = math.cos(a_yaw), math.sin(a_yaw)
     cx, cy = dx * cos_a + dy * sin_a, dy * cos_a - dx * sin_a
-    cos_d, sin_d = math.cos(b_yaw - a_yaw), math.sin(b_yaw - a_yaw)
+    cos_d, sin_d = cos_a * cos_b + sin_a * sin_b, cos_a * sin_b - sin_a * cos_b
     lx, ly = 0.5 * b_length * cos_d, 0.5 * b_length * sin_d
     wx, wy = -0.5 * b_width * sin_d, 0.5 * b_width * cos_d
     x0, y0 = cx + lx + wx, cy + ly + wy
@@ -84,6 +83,25 @@ def bev_intersection(ax, ay, a_length, a_width, a_yaw, bx, by, b_length, b_width
         + _clipped_edge_integral(x3, y3, x0, y0, half_length, half_width)
     )
     return min(area, a_length * a_width, b_length * b_width) if area > 0.0 else 0.0
+
+
+@njit(cache=True, nogil=True)
+def bev_intersection(ax, ay, a_length, a_width, a_yaw, bx, by, b_length, b_width, b_yaw):  # type: ignore[no-untyped-def]
+    """Area that two rotated rectangles share (scalars; numba)."""
+    return turned_intersection(
+        ax,
+        ay,
+        a_length,
+        a_width,
+        math.cos(a_yaw),
+        math.sin(a_yaw),
+        bx,
+        by,
+        b_length,
+        b_width,
+        math.cos(b_yaw),
+        math.sin(b_yaw),
+    )
 
 
 @njit(cache=True, nogil=True)
