@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from lcf3d.errors import ConfigError
+from lcf3d.errors import ConfigError, DatasetError
 
 if TYPE_CHECKING:
     from lcf3d.datasets.kitti import KittiDataset
@@ -46,7 +46,7 @@ def view(
     run_folder = _run_folder(source)
     if run_folder and results:
         raise ConfigError(f"{source} is a run folder and holds its own results; leave --results out")
-    dataset = _open(_dataset_of(run_folder) if run_folder else source)
+    dataset = _open_run(run_folder) if run_folder else _open(source)
     shown = run_folder or results
     ids = _frame_ids(dataset, frame or [], shown, limit)
     scene_of = _scenes(dataset, shown, truth)
@@ -61,24 +61,30 @@ def view(
 def _run_folder(source: str) -> Path | None:
     """The path, if it is a folder written by ``lcf3d run``."""
     path = Path(source)
-    return path if _is_run(path) else None
+    if _is_run(path):
+        return path
+    if ":" not in source and not path.is_dir():
+        raise ConfigError(f"{source} does not exist; view takes kitti:ROOT, nuscenes:ROOT or a folder of lcf3d run")
+    return None
 
 
 def _is_run(path: Path) -> bool:
     return (path / "run.json").is_file() and (path / "provenance").is_dir()
 
 
-def _dataset_of(run_folder: Path) -> str:
+def _open_run(run_folder: Path) -> KittiDataset | NuscenesDataset:
     """The dataset that a run was made from."""
     from lcf3d.formats.files import read_json
 
     run = read_json(run_folder / "run.json")
     dataset = run.get("dataset") if isinstance(run, dict) else None
+    instead = f"name it: lcf3d view kitti:ROOT --results {run_folder}"
     if not isinstance(dataset, str):
-        raise ConfigError(
-            f"{run_folder / 'run.json'} does not name the dataset; name it: view kitti:ROOT --results DIR"
-        )
-    return dataset
+        raise ConfigError(f"{run_folder / 'run.json'} does not say what dataset was run; {instead}")
+    try:
+        return _open(dataset)
+    except DatasetError as error:
+        raise ConfigError(f"the dataset of this run is not there ({error}); {instead}") from None
 
 
 def _open(text: str) -> KittiDataset | NuscenesDataset:

@@ -117,7 +117,7 @@ def _draw_image_boxes(canvas: Canvas, camera: Camera, scene: Scene, scale: float
         return
     for box, used, text in zip(found.boxes * scale, found.used, found.texts, strict=True):
         canvas.lines(rectangle(box), CAMERA_COLOUR, width=1.0, opacity=0.9, dashed=not used)
-        if not used and _is_legible(box):
+        if text and _is_legible(box):
             canvas.label(box.tolist(), text, CAMERA_COLOUR, size=10, filled=False)
 
 

@@ -32,8 +32,8 @@ class ImageBoxes:
 
     Attributes:
         boxes: (M, 4) pixels.
-        used: (M,) whether each led to a fused detection; the others are dashed and labelled.
-        texts: (M,) labels.
+        used: (M,) whether each led to a fused detection; the others are dashed.
+        texts: (M,) labels, empty for none.
     """
 
     boxes: FloatArray
@@ -115,7 +115,7 @@ def _image_boxes(fused: FusedDetections) -> dict[str, ImageBoxes]:
         chosen = found[fused.camera.detection[rows]]
         used = fused.camera.stage[rows] != Stage.DROPPED
         texts = [
-            text if ok else f"{text} {Reason(reason).name.lower().replace('_', ' ')}"
+            "" if ok else f"{text} {Reason(reason).name.lower().replace('_', ' ')}"
             for text, ok, reason in zip(_texts(chosen), used, fused.camera.reason[rows], strict=True)
         ]
         result[name] = ImageBoxes(chosen.boxes, used, tuple(texts))
