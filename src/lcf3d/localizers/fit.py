@@ -16,8 +16,8 @@ PARAMETERS = 7
 X, Y, LIFT, LENGTH, WIDTH, HEIGHT, YAW = range(PARAMETERS)
 
 # yaws tried over half a turn, how many of them are refined, and for how long
-YAWS = 16
-STARTS = 4
+YAWS = 12
+STARTS = 3
 FIRST_ROUNDS = 4
 LAST_ROUNDS = 10
 # solid bodies: how far a point may lie outside and inside of a visible side, in metres, and the most that one inside
