@@ -16,16 +16,21 @@ from typing import Any, Literal, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from lcf3d.errors import DatasetError, FormatError, Lcf3dError, ShapeError
+from lcf3d.errors import DatasetError, FormatError, ShapeError
 from lcf3d.formats.files import write_text
+from lcf3d.formats.kitti_text import (
+    LABEL_COLUMNS,
+    NO_LOCATION,
+    NO_SIZE,
+    RESULT_COLUMNS,
+    has_box3d,
+    parse_files,
+    read_text,
+)
 from lcf3d.geometry.boxes import kitti_from_lidar, lidar_from_kitti, observation_angle
 from lcf3d.structures import Detections2D, Detections3D, FloatArray, IntArray
 
-NO_SIZE = -1.0
-NO_LOCATION = -1000.0
 NO_ANGLE = -10.0
-LABEL_COLUMNS = 15
-RESULT_COLUMNS = 16
 
 _Missing = Literal["error", "empty"]
 
@@ -71,7 +76,7 @@ class KittiObjects:
     @property
     def has_box3d(self) -> NDArray[np.bool_]:
         """(N,) whether the object has a 3D box, not only the "unknown" numbers."""
-        return _has_box3d(self.dimensions, self.locations)
+        return has_box3d(self.dimensions, self.locations)
 
     def __len__(self) -> int:
         return len(self.class_names)
@@ -209,7 +214,7 @@ def read_frame_ids(path: Path) -> tuple[str, ...]:
         DatasetError: the file does not exist.
         FormatError: it names no frame, or one twice.
     """
-    frame_ids = tuple(_read_text(Path(path)).split())
+    frame_ids = tuple(read_text(Path(path)).split())
     if not frame_ids:
         raise FormatError(f"{path} names no frames; expected one frame id a line")
     if len(set(frame_ids)) < len(frame_ids):
@@ -226,11 +231,11 @@ def write_objects(path: Path, objects: KittiObjects) -> None:
 def format_objects(objects: KittiObjects) -> str:
     """The text of a KITTI file, one line an object: lengths to 0.1 mm, pixels to 1e-4, scores to 8 digits."""
     lines = []
-    has_box3d = objects.has_box3d
+    with_box3d = objects.has_box3d
     for i in range(len(objects)):
         fields = [str(objects.class_names[i]), _number(objects.truncated[i]), str(int(objects.occluded[i]))]
         fields += [_number(objects.alpha[i]), *map(_number, objects.boxes2d[i])]
-        if has_box3d[i]:
+        if with_box3d[i]:
             box = (*objects.dimensions[i], *objects.locations[i], objects.rotation_y[i])
         else:
             box = (*(NO_SIZE,) * 3, *(NO_LOCATION,) * 3, NO_ANGLE)
@@ -320,13 +325,6 @@ def _labels(objects: KittiObjects, class_names: Sequence[str]) -> IntArray:
     return labels
 
 
-def _has_box3d(dimensions: FloatArray, locations: FloatArray) -> NDArray[np.bool_]:
-    # tracking labels write -1000 as size, because their columns of unknown numbers are in another order
-    no_size = (dimensions == NO_SIZE).all(axis=1) | (dimensions == NO_LOCATION).all(axis=1)
-    has_box: NDArray[np.bool_] = ~(no_size | (locations == NO_LOCATION).all(axis=1))
-    return has_box
-
-
 def _number(value: float) -> str:
     """``value`` to four decimals, without trailing zeros."""
     text = f"{value:.4f}".rstrip("0").rstrip(".")
@@ -337,41 +335,9 @@ def _starts(counts: Sequence[int]) -> IntArray:
     return np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
 
 
-def _read_text(path: Path) -> str:
-    try:
-        with open(path, "rb", buffering=0) as file:
-            return file.read().decode("utf-8")
-    except FileNotFoundError:
-        raise DatasetError(f"{path} does not exist") from None
-    except IsADirectoryError:
-        raise DatasetError(f"{path} is a folder; expected a text file") from None
-    except UnicodeDecodeError:
-        raise FormatError(f"{path} is not a text file in UTF-8") from None
-
-
 def _read_files(paths: Sequence[Path | None], results: bool) -> tuple[KittiObjects, list[int]]:
     """All objects of the files, one after the other, and how many each file holds; None stands for an empty file."""
-    rows: list[list[str]] = []
-    counts = []
-    for path in paths:
-        before = len(rows)
-        if path is not None:
-            rows += [fields for line in _read_text(path).splitlines() if (fields := line.split())]
-        counts.append(len(rows) - before)
-    columns = RESULT_COLUMNS if results else LABEL_COLUMNS
-    try:
-        if set(map(len, rows)) - {columns}:
-            raise ValueError
-        names = np.array([row[0] for row in rows], dtype=np.str_)
-        values = np.array([float(field) for row in rows for field in row[1:]]).reshape(-1, columns - 1)
-    except ValueError:
-        for index, row in enumerate(rows):
-            problem = _text_problem(row, results)
-            if problem:
-                raise _line_error(paths, counts, index, problem) from None
-        raise
-    for index in _suspicious_rows(values):
-        raise _line_error(paths, counts, int(index), _value_problem(values[index]))
+    names, values, counts = parse_files(paths, RESULT_COLUMNS if results else LABEL_COLUMNS)
     return _from_table(names, values), counts
 
 
@@ -389,48 +355,3 @@ def _from_table(names: NDArray[np.str_], values: FloatArray) -> KittiObjects:
         values[:, 13],
         values[:, 14] if values.shape[1] == 15 else None,
     )
-
-
-def _suspicious_rows(values: FloatArray) -> IntArray:
-    """Indices of the rows that `_value_problem` has a complaint about."""
-    with np.errstate(invalid="ignore"):
-        bad = ~np.isfinite(values).all(axis=1)
-        bad |= values[:, 1] != np.round(values[:, 1])
-        bad |= (values[:, 5] < values[:, 3]) | (values[:, 6] < values[:, 4])
-        bad |= (values[:, 7:10] < 0).any(axis=1) & _has_box3d(values[:, 7:10], values[:, 10:13])
-    return np.flatnonzero(bad)
-
-
-def _value_problem(row: FloatArray) -> str:
-    if not np.isfinite(row).all():
-        column = int(np.flatnonzero(~np.isfinite(row))[0])
-        return f"column {column + 2} is {row[column]}, expected a finite number"
-    if row[1] != np.round(row[1]):
-        return f"occlusion must be a whole number, got {row[1]:g}"
-    if row[5] < row[3] or row[6] < row[4]:
-        return "2D box is reversed, expected x1 <= x2 and y1 <= y2, got " + " ".join(f"{v:g}" for v in row[3:7])
-    return "height, width and length must not be negative, got " + " ".join(f"{v:g}" for v in row[7:10])
-
-
-def _text_problem(fields: list[str], results: bool) -> str:
-    """What is wrong with the split line, or an empty string."""
-    columns = RESULT_COLUMNS if results else LABEL_COLUMNS
-    if len(fields) != columns:
-        kind = "a result (with a score)" if results else "a label (without a score)"
-        return f"expected the {columns} columns of {kind}, got {len(fields)}"
-    for number, field in enumerate(fields[1:], start=2):
-        try:
-            float(field)
-        except ValueError:
-            return f"column {number} must be a number, got {field!r}"
-    return ""
-
-
-def _line_error(paths: Sequence[Path | None], counts: list[int], index: int, problem: str) -> Lcf3dError:
-    """The error for the ``index``-th object, with its file and line number."""
-    starts = _starts(counts)
-    file = int(np.searchsorted(starts, index, side="right")) - 1
-    path = paths[file]
-    assert path is not None  # it holds an object
-    filled = [i for i, line in enumerate(_read_text(path).splitlines(), start=1) if line.strip()]
-    return FormatError(f"{path}:{filled[index - int(starts[file])]}: {problem}")
