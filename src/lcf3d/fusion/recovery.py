@@ -1,4 +1,4 @@
-"""Detection recovery: camera detections without a LiDAR match become 3D boxes (paper section 4.1.4)."""
+"""Detection recovery: camera detections without a LiDAR match become 3D boxes (paper sections 4.1.4 and 4.2.3)."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from lcf3d.structures import Camera, Detections2D, FloatArray, IntArray
 
 
 class Recovery(NamedTuple):
-    """One row a candidate, recovered or not.
+    """One row a candidate, recovered or not; a stereo pair is one candidate.
 
     Attributes:
         camera: (K,) its camera.
@@ -26,8 +26,11 @@ class Recovery(NamedTuple):
         reason: (K,) `Reason` codes; ``LOCALIZED`` for those recovered.
         boxes: (K, 7) localized boxes in the LiDAR frame, NaN where there is none.
         iou: (K,) image IoU of the projected box and the 2D box, NaN where there is no box.
-        scores: (K,) ``s2d * IoU``, NaN where there is no box.
+        scores: (K,) ``s2d * IoU``, of a pair ``s2d * IoU * second_iou``; NaN where there is no box.
         labels: (K,) labels of the 2D detections.
+        second_camera: (K,) camera of a pair's second detection, -1 for a single view.
+        second_detection: (K,) its index among that camera's detections, or -1.
+        second_iou: (K,) image IoU with the second detection, NaN where there is none.
     """
 
     camera: IntArray
@@ -37,6 +40,9 @@ class Recovery(NamedTuple):
     iou: FloatArray
     scores: FloatArray
     labels: IntArray
+    second_camera: IntArray
+    second_detection: IntArray
+    second_iou: FloatArray
 
     @property
     def found(self) -> IntArray:
@@ -57,6 +63,7 @@ def recover(
     mask_mode: MaskMode,
     confirm_iou: float,
     duplicate_iou: float,
+    pairs: IntArray | None = None,
 ) -> Recovery:
     """Lift 2D detections into frustums, localize, confirm, remove duplicates.
 
@@ -70,13 +77,16 @@ def recover(
         enlargement: see `extract_frustums`.
         min_points: see `extract_frustums`.
         mask_mode: see `extract_frustums`.
-        confirm_iou: ``tau_d``; a box is confirmed when the IoU of its projection and the 2D box is higher.
+        confirm_iou: ``tau_d``; a box is confirmed when the IoU of its projection and the 2D box is higher, that of a
+            pair when both IoUs are at least as high (the two sections of the paper differ in that).
         duplicate_iou: BEV IoU above which two boxes are one object; of two recovered boxes the higher score stays.
+        pairs: see `extract_frustums`; the first detection of a pair, the more confident one, is a candidate, the
+            second is not.
 
     Raises:
         DetectorError: the localizer's answer does not have one box a proposal.
     """
-    table = _candidate_table(detections, candidates)
+    table = _candidate_table(detections, candidates, pairs)
     proposals = extract_frustums(
         points,
         cameras,
@@ -85,30 +95,49 @@ def recover(
         enlargement=enlargement,
         min_points=min_points,
         mask_mode=mask_mode,
+        pairs=pairs,
     )
     if not len(proposals):
         return table
     boxes = _localize(localizer, proposals)
     # proposals keep the order of the candidates: camera after camera, then detection
-    key = table.camera * (1 << 32) + table.detection
-    rows = np.searchsorted(key, proposals.camera_index * (1 << 32) + proposals.detection_index)
-    overlap = confirmation_iou(proposals, boxes)
-    table.boxes[rows], table.iou[rows] = boxes, overlap
-    table.scores[rows] = proposals.scores * overlap
-    table.reason[rows] = np.where(
-        np.isnan(overlap),
-        Reason.NOT_LOCALIZED,
-        np.where(overlap > confirm_iou, Reason.LOCALIZED, Reason.DISAGREES),
-    )
+    rows = np.searchsorted(_key(table.camera, table.detection), _key(proposals.camera_index, proposals.detection_index))
+    _confirm(table, rows, proposals, boxes, confirm_iou)
     _mark_duplicates(table, confirmed, duplicate_iou)
     return table
 
 
-def _candidate_table(detections: Sequence[Detections2D], candidates: Sequence[IntArray]) -> Recovery:
+def _confirm(
+    table: Recovery, rows: IntArray, proposals: FrustumProposals, boxes: FloatArray, confirm_iou: float
+) -> None:
+    """Fill the rows of the proposals: boxes, overlaps with the 2D boxes, scores, and whether they are confirmed."""
+    overlap = confirmation_iou(boxes, proposals.cameras, proposals.camera_index, proposals.boxes2d)
+    table.boxes[rows], table.iou[rows] = boxes, overlap
+    table.scores[rows], confirmed = proposals.scores * overlap, overlap > confirm_iou
+    if proposals.second is not None:
+        second = proposals.second
+        paired = second.camera >= 0
+        table.second_iou[rows] = confirmation_iou(boxes, proposals.cameras, second.camera, second.boxes2d)
+        table.scores[rows[paired]] *= table.second_iou[rows[paired]]
+        both = np.minimum(overlap, table.second_iou[rows]) >= confirm_iou
+        confirmed = np.where(paired, both, confirmed)
+    table.reason[rows] = np.where(
+        np.isnan(overlap), Reason.NOT_LOCALIZED, np.where(confirmed, Reason.LOCALIZED, Reason.DISAGREES)
+    )
+
+
+def _key(camera: IntArray, detection: IntArray) -> IntArray:
+    """One number for a camera and its detection, ascending in both."""
+    return camera * (1 << 32) + detection
+
+
+def _candidate_table(
+    detections: Sequence[Detections2D], candidates: Sequence[IntArray], pairs: IntArray | None
+) -> Recovery:
     """All candidates, sorted by camera and detection, as if none had enough points."""
     chosen = [np.sort(c) for c in candidates]
     count = sum(len(c) for c in chosen)
-    return Recovery(
+    table = Recovery(
         camera=np.repeat(np.arange(len(chosen)), [len(c) for c in chosen]).astype(np.int64),
         detection=np.concatenate([np.zeros(0, np.int64), *chosen]).astype(np.int64),
         reason=np.full(count, Reason.FEW_POINTS, dtype=np.int64),
@@ -116,7 +145,14 @@ def _candidate_table(detections: Sequence[Detections2D], candidates: Sequence[In
         iou=np.full(count, np.nan),
         scores=np.full(count, np.nan),
         labels=np.concatenate([np.zeros(0, np.int64), *(d.labels[c] for d, c in zip(detections, chosen, strict=True))]),
+        second_camera=np.full(count, -1, dtype=np.int64),
+        second_detection=np.full(count, -1, dtype=np.int64),
+        second_iou=np.full(count, np.nan),
     )
+    if pairs is not None and len(pairs):
+        rows = np.searchsorted(_key(table.camera, table.detection), _key(pairs[:, 0], pairs[:, 1]))
+        table.second_camera[rows], table.second_detection[rows] = pairs[:, 2], pairs[:, 3]
+    return table
 
 
 def _localize(localizer: Localizer, proposals: FrustumProposals) -> FloatArray:
@@ -131,15 +167,27 @@ def _localize(localizer: Localizer, proposals: FrustumProposals) -> FloatArray:
     return placed
 
 
-def confirmation_iou(proposals: FrustumProposals, boxes: FloatArray) -> FloatArray:
-    """(K,) image IoU of each (K, 7) LiDAR-frame box with the 2D box it came from, NaN for boxes of NaN."""
+def confirmation_iou(
+    boxes: FloatArray, cameras: Sequence[Camera], camera_index: IntArray, boxes2d: FloatArray
+) -> FloatArray:
+    """(K,) image IoU of each (K, 7) LiDAR-frame box with the 2D box it came from.
+
+    Args:
+        boxes: (K, 7), NaN where there is none.
+        cameras: the cameras.
+        camera_index: (K,) camera of each 2D box, -1 where there is none.
+        boxes2d: (K, 4) pixels.
+
+    Returns:
+        NaN where the 3D or the 2D box is missing.
+    """
     overlap = np.full(len(boxes), np.nan)
     there = ~np.isnan(boxes[:, 0])
-    for c, camera in enumerate(proposals.cameras):
-        rows = np.flatnonzero(there & (proposals.camera_index == c))
+    for c, camera in enumerate(cameras):
+        rows = np.flatnonzero(there & (camera_index == c))
         projected, _ = project_boxes(boxes[rows], camera)
         # paired, not crossed: few enough that the diagonal of the matrix is the simplest
-        overlap[rows] = np.diag(image_iou(projected, proposals.boxes2d[rows]))
+        overlap[rows] = np.diag(image_iou(projected, boxes2d[rows]))
     return overlap
 
 
