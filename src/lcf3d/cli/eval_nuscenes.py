@@ -43,6 +43,8 @@ def eval_nuscenes(
     Raises:
         Lcf3dError: tables or results are wrong; one sentence says how.
     """
+    from rich.console import Console
+
     from lcf3d.datasets.nuscenes import find_version
     from lcf3d.datasets.nuscenes_loading import load_tables
     from lcf3d.datasets.nuscenes_splits import default_split, scenes_of_split
@@ -52,9 +54,12 @@ def eval_nuscenes(
 
     version = version or find_version(root)
     split = split or default_split(version)
+    console = Console(stderr=True)
     # the results are read first: they are small, and most mistakes are in them
-    boxes, meta = read_submission(results)
-    tables = load_tables(root, version)
+    with console.status(f"reading {results.name}"):
+        boxes, meta = read_submission(results)
+    with console.status(f"reading the tables of {version} (trainval: half a minute)"):
+        tables = load_tables(root, version)
     rows = tables.rows_of_scenes(tables.scene_names if split is None else scenes_of_split(split))
     if not len(rows):
         raise ConfigError(
@@ -68,8 +73,6 @@ def eval_nuscenes(
     if as_json:
         print(json.dumps(metrics.to_json(), indent=2))
     else:
-        from rich.console import Console
-
         where = "front camera's view" if front else "all around"
         Console().print(
             metrics_table(metrics, f"{results.name}, {split or version}, {len(rows)} samples, {where}", nds_hat)
