@@ -23,7 +23,7 @@ _HEIGHTS = (-2.0, 2.0)
 _LOW, _HIGH = np.array([58.0, 66.0, 82.0]), np.array([165.0, 178.0, 190.0])
 RING_STEP = 10.0
 # metres: around the outermost box centres; behind the LiDAR where cameras only look ahead; most in any direction
-MARGIN, BEHIND, FARTHEST = 6.0, 2.0, 80.0
+MARGIN, BEHIND, FARTHEST = 6.0, 4.0, 80.0
 
 
 @dataclass(frozen=True)
