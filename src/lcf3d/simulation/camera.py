@@ -75,13 +75,29 @@ def camera_rays(camera: Camera, world_from_lidar: NDArray[np.float64], u: NDArra
     return origin, direction
 
 
-def render(camera: Camera, stage: Stage, rng: np.random.Generator, exposure: float | None = None) -> Render:
-    """Image, owners and depth of one camera; ``exposure`` None adapts to the scene."""
+def measure_exposure(camera: Camera, stage: Stage) -> float:
+    """Exposure that brings the lower two thirds of the picture to a middle grey, from a coarse raster of rays."""
+    u, v = np.meshgrid(np.linspace(2, camera.width - 2, 64, dtype=np.float32), np.linspace(camera.height / 3, camera.height - 2, 24, dtype=np.float32))
+    origin, direction = camera_rays(camera, stage.world_from_lidar, u.ravel(), v.ravel())
+    hits = stage.tracer.first_hits(origin, direction)
+    radiance, _ = _radiance(stage, hits, direction, origin, _forward(camera, stage), np.ones(u.size, np.float32), camera)
+    mean = float(np.exp(np.log(np.maximum(radiance.mean(axis=1), 1e-4)).mean()))
+    return float(np.clip(0.16 / mean, 0.35, 6.0 if stage.light.night > 0 else 2.5))
+
+
+def _forward(camera: Camera, stage: Stage) -> NDArray[np.float64]:
+    """(3,) world direction of the camera's optical axis."""
+    forward: NDArray[np.float64] = stage.world_from_lidar[:3, :3] @ camera.camera_from_lidar[2, :3]
+    return forward
+
+
+def render(camera: Camera, stage: Stage, rng: np.random.Generator, exposure: float) -> Render:
+    """Image, owners and depth of one camera."""
     width, height = camera.width, camera.height
     grid_u, grid_v = np.meshgrid(np.arange(width, dtype=np.float32) + 0.5, np.arange(height, dtype=np.float32) + 0.5)
     u, v = grid_u.ravel(), grid_v.ravel()
     origin, direction = camera_rays(camera, stage.world_from_lidar, u, v)
-    forward = (stage.world_from_lidar @ np.linalg.inv(camera.camera_from_lidar))[:3, 2]
+    forward = _forward(camera, stage)
     hits = stage.tracer.first_hits(origin, direction)
     opened = _openness(stage, hits, direction, origin, width, height)
     radiance, normal = _radiance(stage, hits, direction, origin, forward, opened, camera)
@@ -227,21 +243,12 @@ def find_edges(triangle, material, owner, normal, depth):  # type: ignore[no-unt
     return edge
 
 
-def develop(radiance: Floats, rng: np.random.Generator, exposure: float | None, night: bool) -> NDArray[np.uint8]:
+def develop(radiance: Floats, rng: np.random.Generator, exposure: float, night: bool) -> NDArray[np.uint8]:
     """(H, W, 3) uint8 from linear radiance: exposure, film curve, sensor noise, sRGB."""
-    if exposure is None:
-        exposure = meter(radiance, night)
     x = radiance * np.float32(exposure)
     noise = rng.standard_normal(x.shape, dtype=np.float32)
     x = np.maximum(x + noise * (np.float32(0.004) + np.float32(0.012) * np.sqrt(np.maximum(x, 0))) * np.float32(2.0 if night else 1.0), 0)
     return film(x)
-
-
-def meter(radiance: Floats, night: bool) -> float:
-    """Exposure that brings the lower half of the picture to a middle grey."""
-    sample = radiance[radiance.shape[0] // 3 :: 4, ::4]
-    mean = float(np.exp(np.log(np.maximum(sample.mean(axis=2), 1e-4)).mean()))
-    return float(np.clip(0.17 / mean, 0.35, 6.0 if night else 2.2))
 
 
 def film(x: Floats) -> NDArray[np.uint8]:

@@ -101,6 +101,6 @@ def camera_table(texture_ids: dict[str, int]) -> NDArray[np.float32]:
 
 
 def lidar_table() -> NDArray[np.float64]:
-    """(M, 4) reflectance, influence of colour, retro-reflection, and 1 for glass, of every material."""
-    rows = [(m.reflectance, m.colour_matters, m.retro, float(m.kind == Kind.GLASS)) for m in MATERIALS]
+    """(M, 5) reflectance, influence of colour, retro-reflection, 1 for glass, and kind, of every material."""
+    rows = [(m.reflectance, m.colour_matters, m.retro, float(m.kind == Kind.GLASS), float(m.kind)) for m in MATERIALS]
     return np.array(rows, dtype=np.float64)

@@ -50,6 +50,23 @@ class Site:
     side_paths: tuple[Path, ...]
 
     @property
+    def lamps(self) -> list[tuple[float, float, float]]:
+        """World positions of the street lamps' lights."""
+        if self.street.buildings == "woods":
+            return []
+        result = []
+        for side in (1.0, -1.0) if self.street.lanes > 1 else (1.0,):
+            for s in self.lamp_places(side):
+                x, y, _ = self.path.at(s, side * (self.street.half_width + 0.45 - 1.45))
+                result.append((float(x), float(y), float(self.terrain.height(x, y)) + 7.0))
+        return result
+
+    def lamp_places(self, side: float) -> list[float]:
+        """Arc lengths of the lamp posts on one side."""
+        places = np.arange(self.first + 11.0 + 7.0 * side, self.last, 32.0)
+        return [float(s) for s in places if not self.near_crossing(float(s), 1.0)]
+
+    @property
     def gaps(self) -> list[tuple[float, float]]:
         """Stretches of the pavement that side streets take."""
         return [(s - w - 0.5, s + w + 0.5) for s, w in self.crossings]
@@ -305,9 +322,9 @@ def _furniture(site: Site, side: float, rng: np.random.Generator) -> list[Mesh]:
     street = site.street
     edge = street.half_width + 0.45
     parts = []
-    for s in np.arange(site.first + float(rng.uniform(0, 30)), site.last, 32.0):
-        if not site.near_crossing(s, 1.0) and (side > 0 or street.lanes > 1):
-            parts.append(_place(site, _any("lamp", rng), s, edge, side, KERB))
+    lamp = _any("lamp", rng)
+    if side > 0 or street.lanes > 1:
+        parts += [_place(site, lamp, s, edge, side, KERB) for s in site.lamp_places(side)]
     for s in rng.uniform(site.first, site.last, int(rng.poisson((site.last - site.first) * 0.05))):
         if site.near_crossing(s, 1.0):
             continue
