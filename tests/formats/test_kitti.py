@@ -86,6 +86,16 @@ def test_bad_line_in_the_second_file_of_a_folder(tmp_path: Path) -> None:
         kitti.read_folder(tmp_path, ["a", "b"], results=False)
 
 
+def test_bad_line_far_down_a_large_folder(tmp_path: Path) -> None:
+    frame_ids = [f"{i:03}" for i in range(300)]
+    for frame_id in frame_ids:
+        write(tmp_path / f"{frame_id}.txt", LABEL)
+    assert len(kitti.read_folder(tmp_path, frame_ids, results=False).objects) == 300
+    write(tmp_path / "299.txt", LABEL, LABEL, "Car 1")
+    with pytest.raises(FormatError, match=r"299\.txt:3: .* got 2"):
+        kitti.read_folder(tmp_path, frame_ids, results=False)
+
+
 def test_binary_file_is_no_text(tmp_path: Path) -> None:
     (tmp_path / "a.txt").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(FormatError, match="UTF-8"):

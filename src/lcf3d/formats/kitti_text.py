@@ -16,6 +16,8 @@ NO_LOCATION = -1000.0
 LABEL_COLUMNS = 15
 RESULT_COLUMNS = 16
 
+_BATCH = 256
+
 
 def has_box3d(dimensions: FloatArray, locations: FloatArray) -> BoolArray:
     """(N,) whether (N, 3) sizes and locations are those of a 3D box, not the numbers for "unknown"."""
@@ -57,6 +59,13 @@ def parse_files(paths: Sequence[Path | None], columns: int) -> tuple[NDArray[np.
         DatasetError: a file does not exist.
         FormatError: a line is not what it should be; names file and line.
     """
+    # in batches, because the fields of a large folder as Python strings would fill the memory
+    batches = [_parse_batch(paths[i : i + _BATCH], columns) for i in range(0, max(len(paths), 1), _BATCH)]
+    names, values, counts = zip(*batches, strict=True)
+    return np.concatenate(names), np.concatenate(values), [count for part in counts for count in part]
+
+
+def _parse_batch(paths: Sequence[Path | None], columns: int) -> tuple[NDArray[np.str_], FloatArray, list[int]]:
     rows: list[list[str]] = []
     counts = []
     for path in paths:
