@@ -74,28 +74,28 @@ def eval_nuscenes(
         print(json.dumps(metrics.to_json(), indent=2))
     else:
         where = "front camera's view" if front else "all around"
-        Console().print(
-            metrics_table(metrics, f"{results.name}, {split or version}, {len(rows)} samples, {where}", nds_hat)
-        )
+        print_metrics(metrics, f"{results.name}, {split or version}, {len(rows)} samples, {where}", nds_hat)
     return metrics
 
 
+def print_metrics(metrics: NuscenesMetrics, title: str, nds_hat: bool = False) -> None:
+    """Print the table of classes and, below, the scores and what was counted."""
+    from rich.console import Console
+
+    console = Console()
+    console.print(metrics_table(metrics, title, nds_hat))
+    console.print("\n".join(_summary(metrics, nds_hat)), highlight=False)
+
+
 def metrics_table(metrics: NuscenesMetrics, title: str, nds_hat: bool = False) -> Table:
-    """AP and errors by class, means, and NDS as a table to print; a dash where a class has no such error."""
+    """AP (percent) and errors by class and their means; a dash where a class has no such error."""
     import numpy as np
     from rich.table import Table
 
     config = metrics.config
     errors = 3 if nds_hat else len(_ERROR_TITLES)
     # eleven columns have to fit into 80 characters
-    table = Table(
-        title=title,
-        caption=_caption(metrics, nds_hat),
-        caption_justify="left",
-        box=None,
-        padding=(0, 1, 0, 0),
-        pad_edge=False,
-    )
+    table = Table(title=title, title_justify="left", box=None, padding=(0, 1, 0, 0), pad_edge=False)
     table.add_column("class", no_wrap=True)
     for heading in ("AP", *(f"{th:g}m" for th in config.dist_ths), *_ERROR_TITLES[:errors]):
         table.add_column(heading, justify="right", no_wrap=True)
@@ -109,7 +109,7 @@ def metrics_table(metrics: NuscenesMetrics, title: str, nds_hat: bool = False) -
     return table
 
 
-def _caption(metrics: NuscenesMetrics, nds_hat: bool) -> str:
+def _summary(metrics: NuscenesMetrics, nds_hat: bool) -> list[str]:
     score = f"NDS^ {100 * metrics.nds_hat:.2f}" if nds_hat else f"NDS {100 * metrics.nd_score:.2f}"
     lines = [
         f"{score}   mAP {100 * metrics.mean_ap:.2f}",
@@ -120,4 +120,4 @@ def _caption(metrics: NuscenesMetrics, nds_hat: bool) -> str:
     absent = [name for name, n in zip(metrics.class_names, metrics.ground_truth_counts, strict=True) if not n]
     if absent:
         lines.append(f"no ground truth (counts as AP 0, errors 1): {', '.join(absent)}")
-    return "\n".join(lines)
+    return lines
