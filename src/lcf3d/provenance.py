@@ -44,6 +44,9 @@ class Reason(IntEnum):
     NO_SCAN = 17
     OTHER_VIEW = 18
     INVALID = 19
+    NOT_JUDGED = 20
+    SECOND_VIEW = 21
+    UNPAIRED = 22
 
 
 REASON_TEXT = {
@@ -66,7 +69,10 @@ REASON_TEXT = {
     Reason.NO_RECOVERY: "no LiDAR box matches it and recovery is off",
     Reason.NO_SCAN: "no LiDAR box matches it and there is no scan to recover it from",
     Reason.OTHER_VIEW: "its object is matched better in another camera",
+    Reason.NOT_JUDGED: "the camera detector does not detect its class",
     Reason.INVALID: "its box is not finite or has no size",
+    Reason.SECOND_VIEW: "it confirms the cluster beside the more confident view of its stereo pair",
+    Reason.UNPAIRED: "no LiDAR box matches it, and no detection of its stereo pair's other view shows the same object",
 }
 
 
@@ -86,6 +92,7 @@ class Decisions:
         camera_score: score of the 2D detection before fusion.
         score: score after fusion.
         output: index of the output detection this input led to.
+        pair: row of the camera table with the other view's detection of the same object, where a stereo pair has two.
     """
 
     stage: IntArray
@@ -99,6 +106,7 @@ class Decisions:
     camera_score: FloatArray
     score: FloatArray
     output: IntArray
+    pair: IntArray
 
     @classmethod
     def blank(cls, n: int) -> Decisions:
@@ -116,6 +124,7 @@ class Decisions:
             camera_score=nan.copy(),
             score=nan.copy(),
             output=none.copy(),
+            pair=none.copy(),
         )
 
     def __len__(self) -> int:
@@ -127,7 +136,7 @@ class Decisions:
             "stage": Stage(self.stage[index]).name.lower(),
             "reason": Reason(self.reason[index]).name.lower(),
         }
-        for name in ("cluster", "lidar", "camera", "detection", "output"):
+        for name in ("cluster", "lidar", "camera", "detection", "output", "pair"):
             value = int(getattr(self, name)[index])
             result[name] = value if value >= 0 else None
         for name in ("iou", "lidar_score", "camera_score", "score"):
@@ -143,7 +152,8 @@ class Decisions:
             decisions.stage[i] = Stage[row["stage"].upper()]
             decisions.reason[i] = Reason[row["reason"].upper()]
             for column in fields(cls)[2:]:
-                if row[column.name] is not None:
+                # provenance written before a column existed lacks it
+                if row.get(column.name) is not None:
                     getattr(decisions, column.name)[i] = row[column.name]
         return decisions
 
@@ -196,12 +206,18 @@ class FusedDetections:
         if table.lidar[row] >= 0:
             parts.append(f"LiDAR detection {table.lidar[row]} (score {table.lidar_score[row]:.2f})")
         if table.camera[row] >= 0:
-            name = self.camera_names[table.camera[row]]
-            parts.append(f"{name} detection {table.detection[row]} (score {table.camera_score[row]:.2f})")
+            parts.append(self._camera_text(table, row))
+        if table.pair[row] >= 0:
+            parts.append(self._camera_text(self.camera, int(table.pair[row])))
         overlap = "" if np.isnan(table.iou[row]) else f", image IoU {table.iou[row]:.2f}"
         label = self.detections.class_names[self.detections.labels[output]]
         stage = Stage(table.stage[row]).name.lower()
         return f"{label} {self.detections.scores[output]:.2f}, {stage}: {reason}; from {' and '.join(parts)}{overlap}"
+
+    def _camera_text(self, table: Decisions, row: int) -> str:
+        """The 2D detection of a row in words."""
+        name = self.camera_names[table.camera[row]]
+        return f"{name} detection {table.detection[row]} (score {table.camera_score[row]:.2f})"
 
     def _origin(self, output: int) -> tuple[Decisions, int]:
         """The table and row that led to an output: the LiDAR row where there is one."""

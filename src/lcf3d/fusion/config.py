@@ -11,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from lcf3d.errors import ConfigError
 from lcf3d.formats.files import write_text
+from lcf3d.fusion.evidence import Evidence
 from lcf3d.structures import KITTI_CLASSES, NUSCENES_CLASSES, FloatArray
 
 Fraction = Annotated[float, Field(ge=0, le=1)]
@@ -27,6 +28,9 @@ class FusionConfig(BaseModel):
 
     class_names: tuple[str, ...] = Field(default=KITTI_CLASSES, min_length=1, description="classes to detect")
     camera_score_threshold: Fraction = Field(default=0.5, description="2D detections not above it are left out")
+    decisive_score: Fraction = Field(
+        default=0.0, description="2D detections not above it only support boxes of their class: no label, no recovery"
+    )
     lidar_score_threshold: Fraction = Field(default=0.1, description="3D detections not above it are left out")
     max_boxes: int = Field(default=1000, ge=1, description="only so many 3D boxes of highest score a frame take part")
 
@@ -36,8 +40,8 @@ class FusionConfig(BaseModel):
     cluster_iou: Fraction = Field(default=0.3, description="tau_z: BEV IoU that links two boxes")
     class_aware: bool = Field(default=False, description="link boxes of equal class only")
 
-    assignment: Literal["gated", "paper"] = Field(
-        default="gated", description="drop poor pairs before or after assigning"
+    assignment: Literal["gated", "paper", "class_first"] = Field(
+        default="gated", description="drop poor pairs before assigning, after it (paper), or pair equal classes first"
     )
     match_iou: Fraction = Field(default=0.4, description="tau_b: image IoU of a match")
     representative: Literal["highest_score", "camera_class"] = Field(
@@ -60,8 +64,11 @@ class FusionConfig(BaseModel):
         default=0.1, description="BEV IoU with a confirmed box that makes a recovered one a double"
     )
 
-    ensemble: Literal["probabilistic", "product"] = Field(
+    ensemble: Literal["probabilistic", "product", "evidence"] = Field(
         default="probabilistic", description="how agreeing scores are fused"
+    )
+    evidence: dict[str, Evidence] = Field(
+        default_factory=dict, description="ensemble evidence: weights by class, where no calibration gives them"
     )
     priors: dict[str, Annotated[float, Field(gt=0, lt=1)]] = Field(
         default_factory=dict, description="prior by class; classes left out are uniform"
@@ -71,9 +78,10 @@ class FusionConfig(BaseModel):
     def _check_names(self) -> FusionConfig:
         if len(set(self.class_names)) != len(self.class_names):
             raise ValueError("class_names must differ from each other")
-        unknown = sorted(set(self.priors) - set(self.class_names))
-        if unknown:
-            raise ValueError(f"priors names {unknown}, which are not in class_names")
+        for setting in ("priors", "evidence"):
+            unknown = sorted(set(getattr(self, setting)) - set(self.class_names))
+            if unknown:
+                raise ValueError(f"{setting} names {unknown}, which are not in class_names")
         return self
 
     @classmethod

@@ -121,13 +121,33 @@ def match_view(
     *,
     iou_threshold: float,
     method: Assignment = "gated",
+    rounds: Sequence[BoolArray] = (),
 ) -> View:
-    """Project (N, 7) boxes into one camera and match their clusters with its (M, 4) detections."""
+    """Project (N, 7) boxes into one camera and match their clusters with its (M, 4) detections.
+
+    Args:
+        boxes: (N, 7) LiDAR boxes.
+        clusters: their clusters.
+        camera: the camera.
+        boxes2d: (M, 4) its detections.
+        iou_threshold: see `assign`.
+        method: see `assign`.
+        rounds: (C, M) masks: pairs of the first are assigned first, then those of the next among what is left over;
+            all pairs at once if empty.
+    """
     projected, visible = project_boxes(boxes, camera)
     iou = cluster_iou(projected, visible, clusters, boxes2d)
     seen = np.zeros(len(clusters), dtype=bool)
     seen[clusters.index[visible & (clusters.index >= 0)]] = True
-    return View(projected, seen, iou, assign(iou, iou_threshold, method))
+    if not rounds:
+        return View(projected, seen, iou, assign(iou, iou_threshold, method))
+    match = np.full(len(clusters), -1, dtype=np.int64)
+    for allowed in rounds:
+        free = allowed & (match < 0)[:, None]
+        free[:, match[match >= 0]] = False
+        added = assign(np.where(free, iou, 0.0), iou_threshold, method)
+        match[added >= 0] = added[added >= 0]
+    return View(projected, seen, iou, match)
 
 
 def merge_views(views: Sequence[View], cluster_count: int) -> Matches:

@@ -12,10 +12,10 @@ from lcf3d.fusion.clustering import SUPPRESSED, Clusters
 from lcf3d.fusion.config import FusionConfig
 from lcf3d.fusion.matching import Matches, View
 from lcf3d.fusion.recovery import Recovery
-from lcf3d.fusion.semantic import fuse_scores, semantic_fusion
+from lcf3d.fusion.semantic import Ensemble, fuse_scores, semantic_fusion
 from lcf3d.geometry.iou import bev_iou
 from lcf3d.provenance import FusedDetections, Reason, Stage
-from lcf3d.structures import Detections3D, FloatArray, IntArray
+from lcf3d.structures import BoolArray, Detections3D, FloatArray, IntArray
 
 
 class ClusterOutcome(NamedTuple):
@@ -36,23 +36,51 @@ class ClusterOutcome(NamedTuple):
     labels: IntArray
 
 
-def decide_clusters(branches: Branches, clusters: Clusters, matches: Matches, config: FusionConfig) -> ClusterOutcome:
-    """Semantic fusion for matched clusters (Algorithm 1), the chosen policy for all others (METHOD, matching 5-6)."""
+def choose_representatives(branches: Branches, clusters: Clusters, matches: Matches, config: FusionConfig) -> IntArray:
+    """(C,) the LiDAR detection that stands for each cluster (METHOD, matching 5)."""
+    box = clusters.representative.copy()
+    if config.representative == "camera_class":
+        matched = np.flatnonzero(matches.camera >= 0)
+        _, camera_labels = _matched_detections(branches, matches, matched)
+        box[matched] = [
+            _best_of_class(branches.lidar, clusters, int(c), int(label))
+            for c, label in zip(matched, camera_labels, strict=True)
+        ]
+    return box
+
+
+def decide_clusters(
+    box: IntArray,
+    branches: Branches,
+    matches: Matches,
+    config: FusionConfig,
+    judged: BoolArray,
+    weighed: FloatArray | None = None,
+) -> ClusterOutcome:
+    """Semantic fusion for matched clusters (Algorithm 1), the chosen policy for all others (METHOD, matching 6).
+
+    Args:
+        box: (C,) the LiDAR detection that stands for each cluster.
+        branches: what takes part.
+        matches: of the clusters.
+        config: settings.
+        judged: (C,) whether the camera branch detects the cluster's class at all; if not, LiDAR stands alone.
+        weighed: (C,) scores by the evidence of both branches, for ``ensemble: evidence``.
+    """
     lidar = branches.lidar
     matched = np.flatnonzero(matches.camera >= 0)
     camera_scores, camera_labels = _matched_detections(branches, matches, matched)
-    box = clusters.representative.copy()
-    if config.representative == "camera_class":
-        box[matched] = [
-            _best_of_class(lidar, clusters, int(c), int(label)) for c, label in zip(matched, camera_labels, strict=True)
-        ]
     scores, labels = lidar.scores[box], lidar.labels[box]
     stage = np.full(len(box), Stage.KEPT, dtype=np.int64)
     reason = np.full(len(box), Reason.UNCONFIRMED, dtype=np.int64)
 
+    agreed = labels[matched] == camera_labels
+    ensemble: Ensemble = "product" if config.ensemble == "product" else "probabilistic"
     scores[matched], labels[matched] = semantic_fusion(
-        scores[matched], labels[matched], camera_scores, camera_labels, config.prior_array(), config.ensemble
+        scores[matched], labels[matched], camera_scores, camera_labels, config.prior_array(), ensemble
     )
+    if weighed is not None:
+        scores[matched[agreed]] = weighed[matched[agreed]]
     stage[matched], reason[matched] = Stage.MATCHED, Reason.CONFIRMED
 
     unseen = ~matches.visible
@@ -61,14 +89,16 @@ def decide_clusters(branches: Branches, clusters: Clusters, matches: Matches, co
     # with no camera at all nobody could look: the LiDAR branch then stands alone
     if config.out_of_view == "drop" and branches.cameras:
         stage[unseen] = Stage.DROPPED
-    unconfirmed = matches.visible & (matches.camera < 0)
+    reason[matches.visible & ~judged] = Reason.NOT_JUDGED
+    unconfirmed = matches.visible & judged & (matches.camera < 0)
     if config.unmatched == "drop":
         stage[unconfirmed] = Stage.DROPPED
     elif config.unmatched == "downweight":
         reason[unconfirmed] = Reason.DOWNWEIGHTED
-        count = int(unconfirmed.sum())
-        scores[unconfirmed] = fuse_scores(
-            scores[unconfirmed], np.full(count, config.miss_likelihood), np.full(count, 0.5), "probabilistic"
+        scores[unconfirmed] = (
+            fuse_scores(scores, np.array(config.miss_likelihood), np.array(0.5))[unconfirmed]
+            if weighed is None
+            else weighed[unconfirmed]
         )
     return ClusterOutcome(box, stage, reason, scores, labels)
 
@@ -95,7 +125,7 @@ def replace_unconfirmed(
     outcome: ClusterOutcome, lidar: Detections3D, recovery: Recovery, duplicate_iou: float
 ) -> ClusterOutcome:
     """Drop clusters kept without confirmation on whose spot a recovered box stands: one object comes out once."""
-    kept = np.flatnonzero(np.isin(outcome.reason, [Reason.UNCONFIRMED, Reason.DOWNWEIGHTED]))
+    kept = np.flatnonzero(np.isin(outcome.reason, [Reason.UNCONFIRMED, Reason.DOWNWEIGHTED, Reason.NOT_JUDGED]))
     kept = kept[outcome.stage[kept] == Stage.KEPT]
     if not len(kept) or not len(recovery.found):
         return outcome

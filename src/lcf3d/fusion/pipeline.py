@@ -8,14 +8,22 @@ from dataclasses import replace
 import numpy as np
 
 from lcf3d.fusion.branches import Branches, prepare_branches
+from lcf3d.fusion.calibration import Calibration
 from lcf3d.fusion.clustering import Clusters, cluster_boxes
 from lcf3d.fusion.config import FusionConfig
 from lcf3d.fusion.matching import Matches, View, confirmed_elsewhere, match_view, merge_views
-from lcf3d.fusion.outcome import ClusterOutcome, assemble, decide_clusters, replace_unconfirmed
+from lcf3d.fusion.outcome import (
+    ClusterOutcome,
+    assemble,
+    choose_representatives,
+    decide_clusters,
+    replace_unconfirmed,
+)
 from lcf3d.fusion.recovery import Recovery, recover
+from lcf3d.fusion.weighing import Weighed, fused_scores, weigh_clusters
 from lcf3d.localizers.base import Localizer
 from lcf3d.provenance import FusedDetections, Reason, Stage
-from lcf3d.structures import Detections2D, Detections3D, FloatArray, Frame, IntArray
+from lcf3d.structures import BoolArray, Detections2D, Detections3D, FloatArray, Frame, IntArray
 
 
 class LateCascadeFusion:
@@ -24,6 +32,8 @@ class LateCascadeFusion:
     Args:
         config: settings; the defaults of `FusionConfig` if not given.
         localizer: puts boxes into frustums; the geometric one, which needs no weights, if not given.
+        calibration: what the detectors' scores mean, see `lcf3d.fusion.calibration`; scores are taken as they are if
+            not given, and must then lie in [0, 1].
 
     Example:
         >>> fusion = LateCascadeFusion(FusionConfig.preset("kitti"))  # doctest: +SKIP
@@ -31,8 +41,14 @@ class LateCascadeFusion:
         >>> print(fused.explain(0))  # doctest: +SKIP
     """
 
-    def __init__(self, config: FusionConfig | None = None, localizer: Localizer | None = None) -> None:
+    def __init__(
+        self,
+        config: FusionConfig | None = None,
+        localizer: Localizer | None = None,
+        calibration: Calibration | None = None,
+    ) -> None:
         self.config = config or FusionConfig()
+        self.calibration = calibration or Calibration()
         if localizer is None:
             from lcf3d.localizers.geometric import GeometricLocalizer
 
@@ -51,13 +67,47 @@ class LateCascadeFusion:
         Raises:
             ConfigError: scores outside [0, 1], an unknown camera, or class lists that share no name.
         """
-        branches = prepare_branches(frame, lidar, camera, self.config)  # figure 2 (a), (b)
+        branches = self._prepare(frame, lidar, camera)  # figure 2 (a), (b)
         clusters, views, matches = self._match(branches)  # (c) bounding box matching
-        outcome = decide_clusters(branches, clusters, matches, self.config)  # (e) semantic fusion
+        outcome = self._decide(branches, clusters, views, matches)  # (e) semantic fusion
         recovery, notes = self._recover(frame, branches, clusters, views, matches, outcome)  # (d) detection recovery
         outcome = replace_unconfirmed(outcome, branches.lidar, recovery, self.config.duplicate_iou)
         fused = assemble(branches, clusters, views, matches, outcome, recovery, notes)
-        return replace(fused, lidar_inputs=lidar)
+        return replace(fused, lidar_inputs=lidar, camera_inputs=tuple(camera[name] for name in fused.camera_names))
+
+    def weigh(self, frame: Frame, lidar: Detections3D, camera: Mapping[str, Detections2D]) -> Weighed:
+        """The evidence for every cluster of one frame, ``box`` counted in ``lidar``: what calibration is fitted on.
+
+        Clusters that no camera looks at, that none judges, or that are matched with another class have their ``agreed``
+        False.
+        """
+        branches = self._prepare(frame, lidar, camera)
+        clusters, views, matches = self._match(branches)
+        box = choose_representatives(branches, clusters, matches, self.config)
+        weighed = weigh_clusters(box, branches, views, matches, self.config, self.calibration)
+        used = weighed.agreed & matches.visible & self._judged(branches, box)
+        return weighed._replace(box=branches.lidar_index[box], agreed=used)
+
+    def _prepare(self, frame: Frame, lidar: Detections3D, camera: Mapping[str, Detections2D]) -> Branches:
+        """Both branches with calibrated scores, thresholded."""
+        probable = {name: self.calibration.calibrate_camera(found) for name, found in camera.items()}
+        return prepare_branches(frame, self.calibration.calibrate_lidar(lidar), probable, self.config)
+
+    def _judged(self, branches: Branches, boxes: IntArray) -> BoolArray:
+        """Which of some LiDAR boxes are of a class that the camera branch detects at all."""
+        known = np.array([self.calibration.judges(name) for name in self.config.class_names])
+        return np.asarray(known[branches.lidar.labels[boxes]], dtype=bool)
+
+    def _decide(
+        self, branches: Branches, clusters: Clusters, views: Sequence[View], matches: Matches
+    ) -> ClusterOutcome:
+        """Semantic fusion (section 4.1.5) of matched clusters, the chosen policy for the others."""
+        box = choose_representatives(branches, clusters, matches, self.config)
+        scores = None
+        if self.config.ensemble == "evidence":
+            weighed = weigh_clusters(box, branches, views, matches, self.config, self.calibration)
+            scores = fused_scores(weighed, self.config, self.calibration)
+        return decide_clusters(box, branches, matches, self.config, self._judged(branches, box), scores)
 
     def _match(self, branches: Branches) -> tuple[Clusters, list[View], Matches]:
         """Bounding box matching (section 4.1.3): cluster once, match per camera, merge."""
@@ -77,11 +127,26 @@ class LateCascadeFusion:
                 camera,
                 found.boxes,
                 iou_threshold=config.match_iou,
-                method=config.assignment,
+                method="paper" if config.assignment == "paper" else "gated",
+                rounds=self._rounds(branches, clusters, found),
             )
             for camera, found in zip(branches.cameras, branches.camera, strict=True)
         ]
         return clusters, views, merge_views(views, len(clusters))
+
+    def _rounds(self, branches: Branches, clusters: Clusters, found: Detections2D) -> list[BoolArray]:
+        """Which pairs of clusters and 2D detections may match, by round of assignment; empty for all at once.
+
+        Clusters of a class that the camera branch does not detect match nothing. With ``class_first`` pairs of equal
+        class go first; of the others only decisive detections, which may change a label.
+        """
+        boxes = clusters.representative
+        judged = np.broadcast_to(self._judged(branches, boxes)[:, None], (len(boxes), len(found)))
+        if self.config.assignment != "class_first":
+            return [] if judged.all() else [judged]
+        equal = branches.lidar.labels[boxes][:, None] == found.labels[None]
+        decisive = found.scores > self.config.decisive_score
+        return [equal & judged, judged & decisive[None]]
 
     def _recover(
         self,
@@ -96,7 +161,7 @@ class LateCascadeFusion:
         config = self.config
         candidates = []
         for c, (view, found) in enumerate(zip(views, branches.camera, strict=True)):
-            free = np.setdiff1d(np.arange(len(found)), view.match)
+            free = np.setdiff1d(np.flatnonzero(found.scores > config.decisive_score), view.match)
             elsewhere = confirmed_elsewhere(views, matches, clusters, found.boxes[free], c, config.confirm_iou)
             self._mark(branches, c, free[elsewhere], Reason.SEEN_ELSEWHERE)
             candidates.append(free[~elsewhere])

@@ -1,0 +1,244 @@
+"""Score calibration: what a score of a detector means as a probability, by class and branch, in one JSON file.
+
+Fitted on labelled frames by ``lcf3d calibrate`` (`lcf3d.fusion.calibration_fit`), or without labels on a run's own
+frames with the camera as teacher (`self_calibration`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Literal, NamedTuple, TypeVar
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from lcf3d.errors import ConfigError
+from lcf3d.formats.files import read_json, write_text
+from lcf3d.fusion.evidence import MAX_LOG_ODDS, Evidence, to_probability
+from lcf3d.structures import BoolArray, Detections2D, Detections3D, FloatArray
+
+Transform = Literal["identity", "log", "logit"]
+Detections = TypeVar("Detections", Detections2D, Detections3D)
+
+
+def transform_scores(scores: FloatArray, transform: Transform) -> FloatArray:
+    """Scores on the scale on which a calibration is linear.
+
+    ``identity`` for logits, ``log`` (the signed ``log(1 + |s|)``, defined and rising everywhere) for scores without an
+    upper bound, ``logit`` for scores in [0, 1].
+    """
+    if transform == "log":
+        return np.asarray(np.sign(scores) * np.log1p(np.abs(scores)))
+    if transform == "logit":
+        inside = np.clip(scores, 1e-6, 1 - 1e-6)
+        return np.asarray(np.log(inside) - np.log1p(-inside))
+    return np.asarray(scores, dtype=np.float64)
+
+
+class ScoreMap(BaseModel):
+    """A rising map from a detector's score to the probability that the detection is right.
+
+    Attributes:
+        kind: ``platt``, a straight line in log-odds, or ``isotonic``, straight between fitted points.
+        transform: of the score, before the line; see `transform_scores`.
+        slope: of the line; for ``isotonic`` beyond the first and last point.
+        intercept: of the line (``platt``).
+        points: (transformed score, log-odds), both rising (``isotonic``).
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    kind: Literal["platt", "isotonic"] = "platt"
+    transform: Transform = "identity"
+    slope: Annotated[float, Field(gt=0)]
+    intercept: float = 0.0
+    points: tuple[tuple[float, float], ...] = ()
+
+    @model_validator(mode="after")
+    def _check_points(self) -> ScoreMap:
+        if (self.kind == "isotonic") != bool(self.points):
+            raise ValueError("points belong to an isotonic map, which needs at least one")
+        rising = all(a[0] < b[0] and a[1] < b[1] for a, b in zip(self.points[:-1], self.points[1:], strict=True))
+        if not rising:
+            raise ValueError("points must rise in both numbers")
+        return self
+
+    def log_odds(self, scores: FloatArray) -> FloatArray:
+        """(N,) log-odds of (N,) scores."""
+        x = transform_scores(scores, self.transform)
+        if self.kind == "platt":
+            return self.slope * x + self.intercept
+        knots, values = np.array(self.points).T
+        beyond = np.minimum(x - knots[0], 0) + np.maximum(x - knots[-1], 0)
+        return np.asarray(np.interp(x, knots, values) + self.slope * beyond)
+
+    def transformed_at(self, log_odds: FloatArray) -> FloatArray:
+        """(N,) transformed scores that have (N,) log-odds: the inverse of `log_odds`, on the transformed scale."""
+        if self.kind == "platt":
+            return (log_odds - self.intercept) / self.slope
+        knots, values = np.array(self.points).T
+        beyond = np.minimum(log_odds - values[0], 0) + np.maximum(log_odds - values[-1], 0)
+        return np.asarray(np.interp(log_odds, values, knots) + beyond / self.slope)
+
+    def __call__(self, scores: FloatArray) -> FloatArray:
+        """(N,) probabilities of (N,) scores."""
+        return to_probability(np.clip(self.log_odds(scores), -MAX_LOG_ODDS, MAX_LOG_ODDS))
+
+
+class Calibration(BaseModel):
+    """Everything that was fitted for a pair of detectors.
+
+    Attributes:
+        version: of the file's layout.
+        source: what it was fitted on, for people.
+        lidar: score map by class of the LiDAR branch; classes left out keep their scores.
+        camera: the same for the camera branch.
+        evidence: weights by class; classes left out take those of the settings.
+        camera_classes: the classes that the camera branch detects at all, None if all: boxes of other classes are not
+            judged by it.
+        ground_z: height of the ground under the sensor, LiDAR frame, metres; None if unknown.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    version: Literal[1] = 1
+    source: str = ""
+    lidar: dict[str, ScoreMap] = Field(default_factory=dict)
+    camera: dict[str, ScoreMap] = Field(default_factory=dict)
+    evidence: dict[str, Evidence] = Field(default_factory=dict)
+    camera_classes: tuple[str, ...] | None = None
+    ground_z: float | None = None
+
+    @classmethod
+    def load(cls, path: Path | str) -> Calibration:
+        """Read a calibration file.
+
+        Raises:
+            FormatError: the file is absent or not JSON.
+            ConfigError: it is no calibration of this version; names the first wrong entry.
+        """
+        values = read_json(Path(path))
+        try:
+            return cls.model_validate(values)
+        except ValidationError as error:
+            first = error.errors()[0]
+            where = ".".join(str(part) for part in first["loc"])
+            raise ConfigError(
+                f"{path} is not a calibration file of version 1: {where + ': ' if where else ''}{first['msg']}; "
+                "write one with 'lcf3d calibrate'"
+            ) from None
+
+    def dump(self, path: Path | str) -> None:
+        """Write the file, whole or not at all."""
+        write_text(Path(path), self.model_dump_json(indent=2) + "\n")
+
+    def calibrate_lidar(self, detections: Detections3D) -> Detections3D:
+        """The detections with probabilities as scores, where a map for their class is known."""
+        return _with_probabilities(detections, self.lidar)
+
+    def calibrate_camera(self, detections: Detections2D) -> Detections2D:
+        """The detections with probabilities as scores, where a map for their class is known."""
+        return _with_probabilities(detections, self.camera)
+
+    def judges(self, class_name: str) -> bool:
+        """Whether the camera branch detects a class at all."""
+        return self.camera_classes is None or class_name in self.camera_classes
+
+
+def _with_probabilities(detections: Detections, maps: Mapping[str, ScoreMap]) -> Detections:
+    if not len(detections) or not maps:
+        return detections
+    scores = detections.scores.copy()
+    for label, name in enumerate(detections.class_names):
+        if name in maps:
+            own = detections.labels == label
+            scores[own] = maps[name](scores[own])
+    return replace(detections, scores=scores)
+
+
+def load_calibration(text: str) -> Calibration | None:
+    """What ``--calibration`` names: a file, or ``none``. ``auto`` needs the run's frames: see `self_calibration`.
+
+    Raises:
+        Lcf3dError: the file is absent or malformed.
+    """
+    if text == "none":
+        return None
+    if text == "auto":
+        raise ConfigError("'auto' calibrates on the frames of a run: use self_calibration")
+    return Calibration.load(text)
+
+
+class Observation(NamedTuple):
+    """What self-calibration needs to know of one class over a run's frames.
+
+    Attributes:
+        scores: (N,) of all LiDAR boxes of the class.
+        confirmed: (N,) which of them a confident camera detection of the class confirms.
+        judged: (N,) which of them a camera looked at; none if the camera does not detect the class.
+        bottoms: (N,) heights of the undersides of the boxes, LiDAR frame, metres.
+    """
+
+    scores: FloatArray
+    confirmed: BoolArray
+    judged: BoolArray
+    bottoms: FloatArray
+
+
+def self_calibration(observations: Mapping[str, Observation], camera_classes: Sequence[str]) -> Calibration:
+    """A calibration without labels, on a run's own frames, with the camera as teacher.
+
+    The probability that a box is right is taken to be the probability that the camera confirms it, a Platt line with a
+    prior that holds it near a logistic of robustly standardised scores when there is little to see. Works on a handful
+    of frames and on thousands, and gives the same numbers every time.
+
+    Args:
+        observations: by class.
+        camera_classes: classes that the camera branch detected anywhere in the run.
+    """
+    maps = {
+        name: _self_map(seen.scores, seen.confirmed, seen.judged)
+        for name, seen in observations.items()
+        if len(seen.scores)
+    }
+    bottoms = [
+        observations[name].bottoms[score_map(observations[name].scores) > 0.5] for name, score_map in maps.items()
+    ]
+    return Calibration(
+        source="the run's own frames, with the camera as teacher (no labels)",
+        lidar=maps,
+        camera_classes=tuple(camera_classes),
+        ground_z=ground_height(np.concatenate([np.zeros(0), *bottoms])),
+    )
+
+
+def ground_height(bottoms: FloatArray) -> float | None:
+    """Height of the ground under the sensor: the median underside of boxes that are believed; None without any."""
+    return float(np.median(bottoms)) if len(bottoms) else None
+
+
+def _self_map(scores: FloatArray, confirmed: BoolArray, judged: BoolArray) -> ScoreMap:
+    """Platt line of confirmation on score; scores in [0, 1] get a line on their logit."""
+    from lcf3d.fusion.calibration_fit import fit_platt
+
+    transform = natural_transform(scores)
+    x = transform_scores(scores, transform)
+    prior = _standardising_line(x) if transform != "logit" else (1.0, 0.0)
+    slope, intercept = fit_platt(x[judged], confirmed[judged].astype(np.float64), prior=prior, strength=10.0)
+    return ScoreMap(transform=transform, slope=slope, intercept=intercept)
+
+
+def natural_transform(scores: FloatArray) -> Transform:
+    """``logit`` for scores in [0, 1], ``log`` for wide positive ones, ``identity`` (logits) for others."""
+    if scores.min() >= 0 and scores.max() <= 1:
+        return "logit"
+    return "log" if scores.min() >= 0 else "identity"
+
+
+def _standardising_line(x: FloatArray) -> tuple[float, float]:
+    """(slope, intercept) that put the median at even odds and the quartiles about one unit of log-odds from it."""
+    low, middle, high = np.quantile(x, (0.25, 0.5, 0.75))
+    spread = max(float(high - low) / 2, 0.25)
+    return 1 / spread, -float(middle) / spread

@@ -1,0 +1,156 @@
+"""How much each branch is believed: log-odds that add up, one small set of readable numbers a class.
+
+The paper's ensemble multiplies scores as if detectors were calibrated and independent, and its filter deletes what the
+camera misses. Measured on real detectors this helps where the LiDAR branch is poor and hurts where it is good
+(docs/when-fusion-helps.md). Here the log-odds of a LiDAR box are
+
+    base + trust * logit(s3d) + s2d * support(IoU) - miss * exposure - off_ground * slope - rival * p_rival
+
+where ``s2d`` and the image IoU are those of the matched 2D detection (zero without one). No weight is negative and
+``support`` does not fall, so that more camera support never lowers a score.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Annotated
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from lcf3d.structures import FloatArray
+
+Weight = Annotated[float, Field(ge=0)]
+
+# image IoU at which `Evidence.support` is given; it is 0 at IoU 0 and linear in between
+SUPPORT_IOU = (0.5, 0.7, 0.85, 1.0)
+# exposure of an unmatched box: 0 at the first projected height and below, 1 at the second and above
+EXPOSURE_HEIGHTS_PX = (25.0, 150.0)
+# a box this much above or below the ground, as a share of its distance, counts as fully off it
+FULL_SLOPE = 0.05
+# log-odds of scores are kept within these bounds
+MAX_LOG_ODDS = 30.0
+
+
+class Evidence(BaseModel):
+    """The weights of one class. The defaults are those of cars, measured on three pairs of real detectors.
+
+    Attributes:
+        base: log-odds added to every box.
+        trust: weight of the LiDAR score's log-odds; below 1 because the two branches err on the same objects.
+        support: log-odds that a certain 2D detection (score 1) adds at the IoUs of ``SUPPORT_IOU``.
+        miss: log-odds lost when no camera detection matches a box that is large in the image and not cut by its edge.
+        off_ground: log-odds lost by a box that floats or sinks by 5 % of its distance or more.
+        rival: log-odds lost to a certain (score 1) LiDAR box of another class, of higher score, in the same cluster.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    base: float = -0.4
+    trust: Weight = 0.8
+    support: tuple[Weight, Weight, Weight, Weight] = (0.0, 0.3, 1.1, 2.8)
+    miss: Weight = 0.0
+    off_ground: Weight = 2.1
+    rival: Weight = 0.0
+
+    @model_validator(mode="after")
+    def _check_support(self) -> Evidence:
+        if any(b < a for a, b in zip(self.support[:-1], self.support[1:], strict=True)):
+            raise ValueError(f"support must not fall with IoU, got {self.support}")
+        return self
+
+    @classmethod
+    def lidar_alone(cls) -> Evidence:
+        """The LiDAR score as it is."""
+        return cls(base=0, trust=1, support=(0, 0, 0, 0), miss=0, off_ground=0, rival=0)
+
+    @classmethod
+    def from_weights(cls, weights: FloatArray) -> Evidence:
+        """The inverse of `weights`."""
+        trust, rival, off_ground, miss, *steps, base = (float(w) for w in weights)
+        support = np.cumsum(steps)
+        return cls(
+            base=base,
+            trust=trust,
+            support=(float(support[0]), float(support[1]), float(support[2]), float(support[3])),
+            miss=miss,
+            off_ground=off_ground,
+            rival=rival,
+        )
+
+    @property
+    def weights(self) -> FloatArray:
+        """(9,) weights of the columns of `evidence_table`; all but the last, the constant, must not be negative."""
+        steps = np.diff((0.0, *self.support))
+        return np.array([self.trust, self.rival, self.off_ground, self.miss, *steps, self.base])
+
+
+def evidence_table(
+    log_odds: FloatArray,
+    rival: FloatArray,
+    slope: FloatArray,
+    exposure: FloatArray,
+    camera_scores: FloatArray,
+    iou: FloatArray,
+) -> FloatArray:
+    """(N, 9) one column a weight; the log-odds of the boxes are ``table @ evidence.weights``.
+
+    Args:
+        log_odds: (N,) of the LiDAR scores.
+        rival: (N,) score of the best LiDAR box of another class in the same cluster, 0 where that is not higher.
+        slope: (N,) see `ground_slope`.
+        exposure: (N,) see `miss_exposure`; used where no 2D detection is matched.
+        camera_scores: (N,) score of the matched 2D detection, 0 without one.
+        iou: (N,) image IoU with it, 0 without one.
+    """
+    bounds = (0.0, *SUPPORT_IOU)
+    steps = [np.clip((iou - low) / (high - low), 0, 1) for low, high in pairwise(bounds)]
+    unmatched = np.where(iou > 0, 0.0, exposure)
+    columns = [log_odds, -rival, -slope, -unmatched, *(camera_scores * s for s in steps), np.ones(len(iou))]
+    table: FloatArray = np.stack(columns, axis=1)
+    return table
+
+
+def miss_exposure(projected: FloatArray, width: int, height: int) -> FloatArray:
+    """(N,) how plainly a camera should see each box, 0 to 1.
+
+    Grows with the logarithm of the projected height (cameras miss the far and tiny); 0 for boxes that the edge of the
+    image cuts, which are truncated there.
+
+    Args:
+        projected: (N, 4) projections, pixels, clipped to the image.
+        width: image width in pixels.
+        height: image height in pixels.
+    """
+    low, high = EXPOSURE_HEIGHTS_PX
+    tall = np.log(np.maximum(projected[:, 3] - projected[:, 1], 1.0) / low) / np.log(high / low)
+    cut = (projected[:, 0] <= 1) | (projected[:, 2] >= width - 2) | (projected[:, 3] >= height - 2)
+    return np.where(cut, 0.0, np.clip(tall, 0, 1))
+
+
+def ground_slope(boxes: FloatArray, ground_z: float | None) -> FloatArray:
+    """(N,) how far each box floats above or sinks below the ground, as a share of ``FULL_SLOPE``, 0 to 1.
+
+    Height of the bottom over ``ground_z`` by distance: the slope that the road would need to have. 0 where the ground
+    is not known.
+
+    Args:
+        boxes: (N, 7) in the LiDAR frame.
+        ground_z: height of the ground under the sensor in the LiDAR frame, metres, or None.
+    """
+    if ground_z is None:
+        return np.zeros(len(boxes))
+    height = np.abs(boxes[:, 2] - boxes[:, 5] / 2 - ground_z)
+    distance = np.maximum(np.hypot(boxes[:, 0], boxes[:, 1]), 1.0)
+    return np.minimum(height / distance / FULL_SLOPE, 1.0)
+
+
+def to_log_odds(scores: FloatArray) -> FloatArray:
+    """Log-odds of probabilities, within ``MAX_LOG_ODDS``."""
+    with np.errstate(divide="ignore"):
+        return np.asarray(np.clip(np.log(scores) - np.log1p(-scores), -MAX_LOG_ODDS, MAX_LOG_ODDS))
+
+
+def to_probability(log_odds: FloatArray) -> FloatArray:
+    """The inverse of `to_log_odds`."""
+    return np.asarray(1.0 / (1.0 + np.exp(-np.clip(log_odds, -MAX_LOG_ODDS, MAX_LOG_ODDS))))

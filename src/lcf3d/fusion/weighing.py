@@ -1,0 +1,100 @@
+"""Evidence of both branches for every cluster of a frame: what the formula of `lcf3d.fusion.evidence` is fed with."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from lcf3d.fusion.branches import Branches
+from lcf3d.fusion.calibration import Calibration
+from lcf3d.fusion.clustering import cluster_boxes
+from lcf3d.fusion.config import FusionConfig
+from lcf3d.fusion.evidence import (
+    Evidence,
+    evidence_table,
+    ground_slope,
+    miss_exposure,
+    to_log_odds,
+    to_probability,
+)
+from lcf3d.fusion.matching import Matches, View
+from lcf3d.structures import BoolArray, FloatArray, IntArray
+
+
+class Weighed(NamedTuple):
+    """One row a cluster.
+
+    Attributes:
+        box: (C,) the LiDAR detection that stands for it.
+        table: (C, 9) see `evidence_table`.
+        labels: (C,) its LiDAR label.
+        agreed: (C,) whether it is matched with a detection of that label, or with none.
+    """
+
+    box: IntArray
+    table: FloatArray
+    labels: IntArray
+    agreed: BoolArray
+
+
+def weigh_clusters(
+    box: IntArray,
+    branches: Branches,
+    views: Sequence[View],
+    matches: Matches,
+    config: FusionConfig,
+    calibration: Calibration,
+) -> Weighed:
+    """Collect the evidence for every cluster, represented by the LiDAR detections ``box``."""
+    lidar = branches.lidar[box]
+    camera_scores, labels = np.zeros(len(box)), lidar.labels.copy()
+    exposure = np.zeros(len(box))
+    for c, (view, found, camera) in enumerate(zip(views, branches.camera, branches.cameras, strict=True)):
+        here = matches.camera == c
+        camera_scores[here] = found.scores[matches.detection[here]]
+        labels[here] = found.labels[matches.detection[here]]
+        plain = miss_exposure(view.boxes[box], camera.width, camera.height)
+        exposure = np.maximum(exposure, np.where(view.visible, plain, 0.0))
+    table = evidence_table(
+        to_log_odds(lidar.scores),
+        rival_scores(lidar.boxes, lidar.scores, lidar.labels, config),
+        ground_slope(lidar.boxes, calibration.ground_z),
+        exposure,
+        camera_scores,
+        np.where(matches.camera >= 0, np.nan_to_num(matches.iou), 0.0),
+    )
+    return Weighed(box, table, lidar.labels, labels == lidar.labels)
+
+
+def fused_scores(weighed: Weighed, config: FusionConfig, calibration: Calibration) -> FloatArray:
+    """(C,) probability of every cluster."""
+    scores = np.zeros(len(weighed.box))
+    for label, name in enumerate(config.class_names):
+        own = weighed.labels == label
+        evidence = calibration.evidence.get(name) or config.evidence.get(name) or Evidence()
+        scores[own] = to_probability(weighed.table[own] @ evidence.weights)
+    return scores
+
+
+def rival_scores(boxes: FloatArray, scores: FloatArray, labels: IntArray, config: FusionConfig) -> FloatArray:
+    """(N,) score of the best box of another class that shares a clique with each box; 0 where that is not higher.
+
+    LiDAR detectors report one object under two classes; the paper's cluster-wise suppression would delete the lower,
+    here it loses evidence instead.
+    """
+    rival = np.zeros(len(boxes))
+    if not config.class_aware or len(np.unique(labels)) < 2:
+        return rival
+    cluster = cluster_boxes(boxes, scores, labels, method="cliques", iou_threshold=config.cluster_iou).index
+    order = np.lexsort((labels, cluster))
+    starts = np.flatnonzero(np.diff(cluster[order], prepend=-1))
+    sizes = np.diff(np.append(starts, len(order)))
+    for start, size in zip(starts[sizes > 1], sizes[sizes > 1], strict=True):
+        members = order[start : start + size]
+        for i in members:
+            others = members[(labels[members] != labels[i]) & (scores[members] > scores[i])]
+            if len(others):
+                rival[i] = scores[others].max()
+    return rival
