@@ -106,7 +106,7 @@ def test_split_of_a_run_is_taken_from_the_run(
     assert run(monkeypatch, root, root / "good") == 0
     captured = capsys.readouterr()
     assert "KITTI, 2 frames" in captured.out
-    assert "fewer than 41 objects (Car easy 2, Car hard 2, Car moderate 2)" in captured.out
+    assert "objects, easy / moderate / hard: Car 2 / 2 / 2; with fewer than 41" in captured.out
     assert f"{N - 2} result files" in captured.err
     assert "first 10.txt" in captured.err
     assert run(monkeypatch, root, root / "good", "--split", "val") == 0
@@ -135,6 +135,7 @@ def test_missing_frames(root: Path, monkeypatch: pytest.MonkeyPatch, capsys: pyt
         (["good", "half"], "got 2 results; give one, or two with --compare"),
         (["good", "--front"], "--front does not go with KITTI"),
         (["nowhere"], "nowhere is not a folder"),
+        (["good", "--out", "ImageSets/val.txt"], "--out needs a folder, ImageSets/val.txt is a file"),
     ],
 )
 def test_mistakes_are_one_sentence_and_exit_code_2(

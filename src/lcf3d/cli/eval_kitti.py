@@ -60,6 +60,8 @@ def eval_kitti(
 
     if question.missing not in ("error", "empty"):
         raise ConfigError(f"--missing takes error or empty, got {question.missing!r}")
+    if out is not None and out.exists() and not out.is_dir():
+        raise ConfigError(f"--out needs a folder, {out} is a file")
     config = kitti_config(question.classes, question.iou)
     evaluators = [_open(question, path, config, quiet=json_) for path in question.results]
     console = Console()
@@ -258,15 +260,24 @@ def _print_metrics(console: Console, metrics: KittiMetrics) -> None:
 def _remarks(metrics: KittiMetrics) -> list[str]:
     """What a reader of the table should know."""
     from lcf3d.evaluation.curves import SAMPLES
+    from lcf3d.evaluation.kitti import DIFFICULTIES
 
     remarks = []
     absent = [name for name in metrics.config.classes if name not in metrics.class_names]
     if absent:
         remarks.append(f"no detections of {', '.join(absent)}: not evaluated, as in the official program")
-    few = sorted({(k[0], k[2], c.object_count) for k, c in metrics.curves.items() if c.object_count < SAMPLES})
+    few = []
+    for name in metrics.class_names:
+        measure = metrics.measures(name)[0]
+        counts = [metrics.curves[name, measure, difficulty].object_count for difficulty in DIFFICULTIES]
+        if min(counts) < SAMPLES:
+            few.append(f"{name} {' / '.join(map(str, counts))}")
     if few:
-        listed = ", ".join(f"{name} {difficulty} {count}" for name, difficulty, count in few)
-        remarks.append(f"fewer than {SAMPLES} objects ({listed}): the official sampling cannot reach 100 there")
+        listed = ", ".join(few)
+        remarks.append(
+            f"objects, {' / '.join(DIFFICULTIES)}: {listed}; with fewer than {SAMPLES} the official sampling cannot "
+            "reach 100"
+        )
     return remarks
 
 
