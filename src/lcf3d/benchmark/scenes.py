@@ -54,7 +54,7 @@ def detections(
     boxes2d += rng.normal(0, 0.03, boxes2d.shape) * np.tile(sides, 2)
     missed = rng.uniform(size=camera_count) < 0.1
     boxes2d[missed] = [100, 20, 160, 60]
-    camera = Detections2D(boxes2d, rng.uniform(0.5, 1, camera_count), np.zeros(camera_count), KITTI_CLASSES)
+    camera = Detections2D(boxes2d, rng.uniform(0.5, 1, camera_count), np.zeros(camera_count, np.int64), KITTI_CLASSES)
     return Frame("bench", scan(objects, point_count, rng), [view]), lidar, camera
 
 

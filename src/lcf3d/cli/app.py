@@ -11,6 +11,7 @@ from lcf3d.errors import Lcf3dError
 
 # verb -> module of lcf3d.cli that defines a function of that name; heavy imports stay inside the functions
 VERBS: dict[str, str] = {
+    "demo": "demo",
     "simulate": "simulate",
     "run": "run",
     "view": "view",
