@@ -84,9 +84,7 @@ def decode_residuals(anchors: FloatArray, residuals: FloatArray) -> FloatArray:
     return boxes
 
 
-def decode_anchor_maps(
-    maps: Sequence[tuple[Map, Map, Map]], spec: AnchorSpec, classes: int, count: int
-) -> Candidates:
+def decode_anchor_maps(maps: Sequence[tuple[Map, Map, Map]], spec: AnchorSpec, classes: int, count: int) -> Candidates:
     """The ``count`` best anchors (of each map, or of all when ``spec.joint``), decoded.
 
     Args:
@@ -213,13 +211,11 @@ def _within(boxes: FloatArray, limits: tuple[float, ...]) -> BoolArray:
     """Whether the geometric centre of each box lies in the (6,) volume."""
     centers = boxes[:, :3].copy()
     centers[:, 2] += boxes[:, 5] / 2
-    inside: BoolArray = ((centers >= limits[:3]) & (centers <= limits[3:])).all(axis=1)
+    inside: BoolArray = np.all((centers >= limits[:3]) & (centers <= limits[3:]), axis=1)
     return inside
 
 
-def detections(
-    boxes: FloatArray, scores: FloatArray, labels: IntArray, config: LidarConfig
-) -> Detections3D:
+def detections(boxes: FloatArray, scores: FloatArray, labels: IntArray, config: LidarConfig) -> Detections3D:
     """Canonical detections of bottom-centre boxes (N, 7 or 9)."""
     velocities = boxes[:, 7:9] if config.has_velocity else None
     return Detections3D(canonical_from_mmdet3d(boxes), scores, labels, config.class_names, velocities)

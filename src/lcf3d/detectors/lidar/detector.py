@@ -112,7 +112,9 @@ class TorchLidarDetector(ABC):
         inputs = self.inputs(points)
         if inputs is None:
             empty = Detections3D.empty(self.class_names)
-            return Detections3D(**{**vars(empty), "velocities": np.zeros((0, 2))}) if self.config.has_velocity else empty
+            return (
+                Detections3D(**{**vars(empty), "velocities": np.zeros((0, 2))}) if self.config.has_velocity else empty
+            )
         with torch.inference_mode():
             return self.detect({name: torch.from_numpy(value).to(self.device) for name, value in inputs.items()})
 

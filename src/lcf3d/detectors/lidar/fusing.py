@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from lcf3d.detectors.lidar._torch import nn, torch
+from lcf3d.detectors.lidar.sparse import SparseConvolution
 
 _NORMS = (nn.BatchNorm1d, nn.BatchNorm2d)
-_LAYERS = (nn.Conv1d, nn.Conv2d, nn.ConvTranspose2d, nn.Linear)
+_LAYERS = (nn.Conv1d, nn.Conv2d, nn.ConvTranspose2d, nn.Linear, SparseConvolution)
 _NAMED_PAIRS = (("conv", "bn"), ("linear", "norm"), ("conv1", "bn1"), ("conv2", "bn2"), ("conv3", "bn3"))
 
 
@@ -37,9 +38,8 @@ def _fold(layer: nn.Module, norm: nn.Module) -> None:
     scale = norm.weight.double() / torch.sqrt(norm.running_var.double() + norm.eps)
     shift = norm.bias.double() - norm.running_mean.double() * scale
     bias = shift if layer.bias is None else shift + layer.bias.double() * scale
-    out_axis = 1 if isinstance(layer, nn.ConvTranspose2d) else 0
     shape = [1] * layer.weight.ndim
-    shape[out_axis] = -1
+    shape[-1 if isinstance(layer, SparseConvolution) else 1 if isinstance(layer, nn.ConvTranspose2d) else 0] = -1
     weight = layer.weight.double() * scale.reshape(shape)
     layer.weight = nn.Parameter(weight.to(layer.weight.dtype), requires_grad=False)
     layer.bias = nn.Parameter(bias.to(layer.weight.dtype), requires_grad=False)
