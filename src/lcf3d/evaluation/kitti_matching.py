@@ -79,6 +79,8 @@ def score_events(
         np.array(truth.objects.alpha),
         np.array(results.objects.alpha),
         np.array(scores),
+        # sorted here, since numba would compile a sort of its own; by frame, then by falling score
+        np.lexsort((-scores, results.frame_of_object)),
         with_similarity,
     )
     hits = hits[np.argsort(-hits[:, 0], kind="stable")]
@@ -230,7 +232,7 @@ def _assign(  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True)
 def _score_events(  # type: ignore[no-untyped-def]
     object_starts, detection_starts, pairs, overlap, min_overlap, object_codes, detection_codes, is_dontcare,
-    object_alpha, detection_alpha, scores, with_similarity
+    object_alpha, detection_alpha, scores, order, with_similarity
 ):  # fmt: skip
     """Objects that count by frame, (H, 2) hits (score, frame), (E, 5) events (score, frame, changes)."""
     n_frames, n_detections = len(object_starts) - 1, len(scores)
@@ -271,14 +273,13 @@ def _score_events(  # type: ignore[no-untyped-def]
                     hits[n_hits, 0], hits[n_hits, 1] = scores[best], f
                     n_hits += 1
         # detections come in by falling score; equal scores come in together
-        order = d0 + np.argsort(-scores[d0:d1])
         true_before, false_before, similar_before, reported = 0, 0, 0.0, 0
         true, taken, similar = 0, 0, 0.0
-        k = 0
-        while k < len(order):
+        k = d0
+        while k < d1:
             threshold = scores[order[k]]
             changed = False
-            while k < len(order) and scores[order[k]] == threshold:
+            while k < d1 and scores[order[k]] == threshold:
                 reported += detection_codes[order[k]] == 0 and not cover[order[k]]
                 changed |= is_candidate[order[k]]
                 k += 1
