@@ -90,7 +90,8 @@ def golden(shared: Path) -> Callable[[str], Golden]:
     """Parity data by model name."""
     folder = shared / "golden" / "models"
     spec = importlib.util.spec_from_file_location("fill", folder / "fill.py")
-    assert spec is not None and spec.loader is not None
+    assert spec is not None
+    assert spec.loader is not None
     fill = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(fill)
     return lambda name: Golden(folder, name, fill)

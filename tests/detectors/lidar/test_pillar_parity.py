@@ -75,7 +75,9 @@ def test_ssn(run, name, preset):
     check_trunk(data, outputs, "pts_")
     for i, depth in enumerate((10, 9, 2)):
         # the original flattens every group to (anchor, row, column) and concatenates the groups
-        flat = [maps[i].reshape(1, -1, depth, *maps[i].shape[2:]).permute(0, 1, 3, 4, 2) for maps in outputs["bbox_head"]]
+        flat = [
+            maps[i].reshape(1, -1, depth, *maps[i].shape[2:]).permute(0, 1, 3, 4, 2) for maps in outputs["bbox_head"]
+        ]
         data.check(f"pts_bbox_head.{i}.0", torch.cat([x.reshape(1, -1, depth) for x in flat], dim=1), DENSE)
     data.check_predictions(detections)
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -97,7 +98,7 @@ def decode_anchor_maps(maps: Sequence[tuple[Map, Map, Map]], spec: AnchorSpec, c
     if spec.joint:
         bounds = np.cumsum([0] + [len(p) for p in peaks])
         chosen = best(np.concatenate(peaks), count)
-        selections = [chosen[(chosen >= a) & (chosen < b)] - a for a, b in zip(bounds[:-1], bounds[1:], strict=True)]
+        selections = [chosen[(chosen >= a) & (chosen < b)] - a for a, b in pairwise(bounds)]
     else:
         selections = [best(peak, count) for peak in peaks]
     parts = [

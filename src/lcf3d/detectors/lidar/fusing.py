@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import pairwise
 
 from lcf3d.detectors.lidar._torch import nn, torch
 from lcf3d.detectors.lidar.sparse import SparseConvolution
@@ -16,7 +17,7 @@ def _pairs(module: nn.Module) -> Iterator[tuple[str, str]]:
     """Names of the children of ``module`` that are a layer and the normalization of its output."""
     if isinstance(module, nn.Sequential):
         names = list(module._modules)
-        yield from zip(names[:-1], names[1:], strict=True)
+        yield from pairwise(names)
     else:
         yield from (pair for pair in _NAMED_PAIRS if all(hasattr(module, name) for name in pair))
 

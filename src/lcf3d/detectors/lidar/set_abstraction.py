@@ -1,0 +1,44 @@
+"""Set abstraction: what surrounds a point, at several radii (PointNet++, section 3.3; PV-RCNN, section 3.2)."""
+
+# mypy: allow-subclassing-any
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from lcf3d.detectors.lidar._torch import Tensor, nn, torch
+from lcf3d.detectors.lidar.backbones import ConvModule
+from lcf3d.detectors.lidar.point_ops import ball_query
+
+
+class SetAbstraction(nn.Module):
+    """For each radius: neighbours, shared layers, maximum; the results concatenated.
+
+    Args:
+        in_channels: channels of the points, without their position.
+        radii: in metres.
+        counts: neighbours taken at each radius.
+        channels: output channels of both layers, at every radius.
+    """
+
+    def __init__(self, in_channels: int, radii: Sequence[float], counts: Sequence[int], channels: int) -> None:
+        super().__init__()
+        self.radii = tuple(radii)
+        self.counts = tuple(counts)
+        self.mlps = nn.ModuleList()
+        for _ in radii:
+            layers = nn.Sequential()
+            layers.add_module("layer0", ConvModule(in_channels + 3, channels, 1, eps=1e-5))
+            layers.add_module("layer1", ConvModule(channels, channels, 1, eps=1e-5))
+            self.mlps.append(layers)
+
+    def forward(self, positions: Tensor, features: Tensor, centers: Tensor) -> Tensor:
+        """(M, channels * radii) features at (M, 3) centers from (N, C) features at (N, 3) positions."""
+        outputs = []
+        for radius, count, mlp in zip(self.radii, self.counts, self.mlps, strict=True):
+            index = ball_query(centers, positions, radius, count)
+            empty = index[:, 0] < 0
+            index = index.clamp(min=0)
+            grouped = torch.cat([positions[index] - centers[:, None], features[index]], dim=2)
+            grouped[empty] = 0
+            outputs.append(mlp(grouped.permute(2, 0, 1)[None]).amax(dim=3)[0].t())
+        return torch.cat(outputs, dim=1)
