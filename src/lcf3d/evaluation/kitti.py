@@ -244,7 +244,6 @@ class KittiEvaluator:
             self.overlap[selection.measure],
             self._min_overlap(selection) if min_overlap is None else min_overlap,
             *self.codes(selection),
-            with_similarity=selection.measure == "bbox",
         )
 
     def match_at(self, selection: Selection, threshold: float) -> tuple[IntArray, IntArray]:

@@ -6,6 +6,8 @@ the ``(objects, detections)`` matrix stored row after row from ``pair_starts[f]`
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numba import njit
 
@@ -52,7 +54,6 @@ def score_events(
     min_overlap: float,
     object_codes: IntArray,
     detection_codes: IntArray,
-    with_similarity: bool,
 ) -> ScoreEvents:
     """Match every frame at every score threshold.
 
@@ -63,7 +64,6 @@ def score_events(
         min_overlap: a pair may match when its overlap is greater.
         object_codes: (N,) `COUNTS`, `IGNORED` or `OTHER`; DontCare regions are `OTHER`.
         detection_codes: (M,) the same for detections.
-        with_similarity: sum up the orientation similarity of the matches (AOS).
     """
     scores = results.objects.scores
     assert scores is not None  # checked by the caller
@@ -81,7 +81,6 @@ def score_events(
         np.array(scores),
         # sorted here, since numba would compile a sort of its own; by frame, then by falling score
         np.lexsort((-scores, results.frame_of_object)),
-        with_similarity,
     )
     hits = hits[np.argsort(-hits[:, 0], kind="stable")]
     events = events[np.argsort(-events[:, 0], kind="stable")]
@@ -230,9 +229,44 @@ def _assign(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
+def _take_highest_scores(  # type: ignore[no-untyped-def]
+    first_object, last_object, scores, candidate_starts, candidates, assigned, matches
+):
+    """Assign detections as for the recall thresholds: nothing is cut, objects choose the free one of highest score."""
+    for c in range(candidate_starts[last_object - first_object]):
+        assigned[candidates[c]] = False
+    for i in range(first_object, last_object):
+        best = -1
+        for c in range(candidate_starts[i - first_object], candidate_starts[i - first_object + 1]):
+            j = candidates[c]
+            if not assigned[j] and (best == -1 or scores[j] > scores[best]):
+                best = j
+        matches[i] = best
+        if best != -1:
+            assigned[best] = True
+
+
+@njit(cache=True, nogil=True)
+def _count_matches(  # type: ignore[no-untyped-def]
+    first_object, last_object, matches, object_codes, detection_codes, cover, object_alpha, detection_alpha
+):
+    """True positives, detections that a match keeps from being false positives, and summed orientation similarity."""
+    true, taken, similar = 0, 0, 0.0
+    for i in range(first_object, last_object):
+        j = matches[i]
+        if j == -1 or detection_codes[j] != 0:
+            continue
+        taken += not cover[j]
+        if object_codes[i] == 0:
+            true += 1
+            similar += (1.0 + math.cos(object_alpha[i] - detection_alpha[j])) / 2.0
+    return true, taken, similar
+
+
+@njit(cache=True, nogil=True)
 def _score_events(  # type: ignore[no-untyped-def]
     object_starts, detection_starts, pairs, overlap, min_overlap, object_codes, detection_codes, is_dontcare,
-    object_alpha, detection_alpha, scores, order, with_similarity
+    object_alpha, detection_alpha, scores, order
 ):  # fmt: skip
     """Objects that count by frame, (H, 2) hits (score, frame), (E, 5) events (score, frame, changes)."""
     n_frames, n_detections = len(object_starts) - 1, len(scores)
@@ -257,21 +291,13 @@ def _score_events(  # type: ignore[no-untyped-def]
             o0, o1, d0, d1, pairs[f], overlap, min_overlap, object_codes, detection_codes, is_dontcare, cover,
             candidate_starts, candidates, candidate_overlaps
         )  # fmt: skip
-        # recall thresholds: with nothing cut, each object takes the free detection of the highest score
         for c in range(n_candidates):
-            assigned[candidates[c]] = False
             is_candidate[candidates[c]] = True
+        _take_highest_scores(o0, o1, scores, candidate_starts, candidates, assigned, matches)
         for i in range(o0, o1):
-            best = -1
-            for c in range(candidate_starts[i - o0], candidate_starts[i - o0 + 1]):
-                j = candidates[c]
-                if not assigned[j] and (best == -1 or scores[j] > scores[best]):
-                    best = j
-            if best != -1:
-                assigned[best] = True
-                if object_codes[i] == 0 and detection_codes[best] == 0:
-                    hits[n_hits, 0], hits[n_hits, 1] = scores[best], f
-                    n_hits += 1
+            if matches[i] != -1 and object_codes[i] == 0 and detection_codes[matches[i]] == 0:
+                hits[n_hits, 0], hits[n_hits, 1] = scores[matches[i]], f
+                n_hits += 1
         # detections come in by falling score; equal scores come in together
         true_before, false_before, similar_before, reported = 0, 0, 0.0, 0
         true, taken, similar = 0, 0, 0.0
@@ -284,20 +310,13 @@ def _score_events(  # type: ignore[no-untyped-def]
                 changed |= is_candidate[order[k]]
                 k += 1
             if changed:
-                true, taken, similar = 0, 0, 0.0
                 _assign(
                     o0, o1, threshold, object_codes, detection_codes, scores, candidate_starts, candidates,
                     candidate_overlaps, assigned, matches
                 )  # fmt: skip
-                for i in range(o0, o1):
-                    j = matches[i]
-                    if j == -1:
-                        continue
-                    taken += detection_codes[j] == 0 and not cover[j]
-                    if object_codes[i] == 0 and detection_codes[j] == 0:
-                        true += 1
-                        if with_similarity:
-                            similar += (1.0 + np.cos(object_alpha[i] - detection_alpha[j])) / 2.0
+                true, taken, similar = _count_matches(
+                    o0, o1, matches, object_codes, detection_codes, cover, object_alpha, detection_alpha
+                )
             false = reported - taken
             if true != true_before or false != false_before or similar != similar_before:
                 events[n_events, 0], events[n_events, 1] = threshold, f
