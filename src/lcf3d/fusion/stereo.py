@@ -1,0 +1,289 @@
+"""Late-cascade fusion with stereo pairs (paper section 4.2): each view confirms, both views together recover."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any, Literal, NamedTuple
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from lcf3d.errors import ConfigError
+from lcf3d.fusion.branches import Branches
+from lcf3d.fusion.clustering import Clusters
+from lcf3d.fusion.config import PRESETS, FusionConfig
+from lcf3d.fusion.matching import Matches, View, confirmed_elsewhere
+from lcf3d.fusion.outcome import ClusterOutcome
+from lcf3d.fusion.pipeline import LateCascadeFusion
+from lcf3d.fusion.recovery import Recovery, recover
+from lcf3d.fusion.semantic import fuse_scores
+from lcf3d.fusion.stereo_pairing import check_not_exchanged, check_stereo_pair, pair_views
+from lcf3d.localizers.base import Localizer
+from lcf3d.provenance import Decisions, FusedDetections, Reason
+from lcf3d.structures import Detections2D, Detections3D, Frame, IntArray
+
+
+class StereoConfig(FusionConfig):
+    """Settings of `StereoLateCascadeFusion`: those of `FusionConfig`, with ``match_iou`` 0.5, and four more."""
+
+    match_iou: Annotated[float, Field(ge=0, le=1)] = Field(default=0.5, description="tau_b: image IoU of a match")
+    pairs: tuple[tuple[str, str], ...] = Field(
+        default=(("left", "right"),), min_length=1, description="stereo pairs of camera names, the left one first"
+    )
+    epipolar_gate_px: Annotated[float, Field(gt=0)] = Field(
+        default=10.0, description="corners farther than that from their epipolar lines, on average, are of two objects"
+    )
+    check_depth: bool = Field(
+        default=True, description="views pair only where disparity and height in the image give a believable size"
+    )
+    unpaired: Literal["discard", "single_view"] = Field(
+        default="discard", description="2D detections that only one view of a pair has: drop, or recover from that view"
+    )
+
+    @model_validator(mode="after")
+    def _check_pairs(self) -> StereoConfig:
+        names = [name for pair in self.pairs for name in pair]
+        if len(set(names)) != len(names):
+            raise ValueError(f"pairs must name each camera once, got {[list(pair) for pair in self.pairs]}")
+        return self
+
+    @classmethod
+    def preset(cls, name: str) -> StereoConfig:
+        """The settings of `FusionConfig.preset` with the stereo values; ``paper`` leaves ``check_depth`` out.
+
+        Raises:
+            ConfigError: there is no such preset.
+        """
+        FusionConfig.preset(name)
+        values: dict[str, Any] = {**PRESETS[name], "match_iou": 0.5, "check_depth": name != "paper"}
+        return cls(**values)
+
+
+class _Pair(NamedTuple):
+    """A stereo pair of which both cameras are used: their positions among the cameras of the fusion."""
+
+    left: int
+    right: int
+
+
+class StereoLateCascadeFusion(LateCascadeFusion):
+    """`LateCascadeFusion` with stereo pairs (paper section 4.2); cameras in no pair are treated as there.
+
+    A LiDAR cluster is confirmed by either view. 2D detections that match nothing are recovered in pairs, one of each
+    view, from the points in both frustums. A pair of which one camera has no detections given is a single camera.
+
+    Args:
+        config: settings; the defaults of `StereoConfig` if not given.
+        localizer: see `LateCascadeFusion`.
+        options: what else `LateCascadeFusion` takes.
+
+    Example:
+        >>> fusion = StereoLateCascadeFusion(StereoConfig.preset("kitti"))  # doctest: +SKIP
+        >>> fused = fusion(frame, lidar, {"left": left_detections, "right": right_detections})  # doctest: +SKIP
+    """
+
+    config: StereoConfig
+
+    def __init__(self, config: StereoConfig | None = None, localizer: Localizer | None = None, **options: Any) -> None:
+        super().__init__(config or StereoConfig(), localizer, **options)
+
+    def __call__(self, frame: Frame, lidar: Detections3D, camera: Mapping[str, Detections2D]) -> FusedDetections:
+        """Fuse the detections of one frame; see `LateCascadeFusion.__call__`.
+
+        Raises:
+            ConfigError: also for a pair that is not calibrated, has images of different size, or is exchanged.
+        """
+        fused = super().__call__(frame, lidar, camera)
+        _follow_first_views(fused.camera)
+        return fused
+
+    def _prepare(self, frame: Frame, lidar: Detections3D, camera: Mapping[str, Detections2D]) -> Branches:
+        """Both branches, the pairs checked, and a note on every pair that is not whole."""
+        known = {view.name for view in frame.cameras}
+        notes = []
+        for left, right in self.config.pairs:
+            absent = [name for name in (left, right) if name in camera and name not in known]
+            if absent:
+                raise ConfigError(
+                    f"frame {frame.id}: stereo pair {left}/{right} needs both cameras calibrated, but there is no "
+                    f"calibration of {absent[0]!r}, only of {sorted(known)}; add it or run with one camera"
+                )
+            if (left in camera) != (right in camera):
+                only = left if left in camera else right
+                notes.append(f"stereo pair {left}/{right} is not whole: {only} was used as a single camera")
+        branches = super()._prepare(frame, lidar, camera)
+        for pair in self._pairs(branches):
+            views = branches.cameras[pair.left], branches.cameras[pair.right]
+            check_stereo_pair(*views)
+            found = branches.camera[pair.left], branches.camera[pair.right]
+            check_not_exchanged(*views, *found, self.config.epipolar_gate_px)
+        return branches._replace(notes=(*branches.notes, *notes))
+
+    def _pairs(self, branches: Branches) -> list[_Pair]:
+        """The pairs of which both cameras are used."""
+        position = {view.name: c for c, view in enumerate(branches.cameras)}
+        return [_Pair(position[a], position[b]) for a, b in self.config.pairs if a in position and b in position]
+
+    def _match(self, branches: Branches) -> tuple[Clusters, list[View], Matches]:
+        """Bounding box matching in every view (section 4.2.2); the more confident view of a pair is the primary one."""
+        clusters, views, matches = super()._match(branches)
+        for pair in self._pairs(branches):
+            _prefer_confident_view(pair, branches, views, matches)
+        return clusters, views, matches
+
+    def _decide(
+        self, branches: Branches, clusters: Clusters, views: Sequence[View], matches: Matches
+    ) -> ClusterOutcome:
+        """Stereo semantic fusion (section 4.2.4): the second view's score joins where the views' labels agree."""
+        outcome = super()._decide(branches, clusters, views, matches)
+        for pair in self._pairs(branches):
+            self._fuse_second_views(pair, branches, views, matches, outcome)
+        return outcome
+
+    def _fuse_second_views(
+        self, pair: _Pair, branches: Branches, views: Sequence[View], matches: Matches, outcome: ClusterOutcome
+    ) -> None:
+        """Multiply in ``s2d / p`` of the second view of clusters matched in both, and note the views as a pair.
+
+        With ``ensemble: evidence`` scores stay: what two views of one detector say is not independent, and the weights
+        were fitted for one.
+        """
+        priors = self.config.prior_array()
+        for first, second in (pair, _Pair(pair.right, pair.left)):
+            both = np.flatnonzero((matches.camera == first) & (views[second].match >= 0))
+            other = views[second].match[both]
+            rows, other_rows = _rows(branches, first, matches.detection[both]), _rows(branches, second, other)
+            table = branches.camera_table
+            table.pair[rows], table.pair[other_rows] = other_rows, rows
+            branches.lidar_table.pair[branches.lidar_index[outcome.box[both]]] = other_rows
+            if self.config.ensemble == "evidence":
+                continue
+            found = branches.camera[second]
+            agreed = found.labels[other] == outcome.labels[both]
+            both, other = both[agreed], other[agreed]
+            outcome.scores[both] = fuse_scores(
+                outcome.scores[both], found.scores[other], priors[outcome.labels[both]], self.config.ensemble
+            )
+
+    def _pair_candidates(self, branches: Branches, candidates: list[IntArray]) -> tuple[list[IntArray], IntArray]:
+        """Candidates with each pair's second view taken out, and the pairs as `recover` wants them (section 4.2.3).
+
+        The more confident detection of a pair comes first. Detections left alone are taken out and marked, or stay, as
+        ``unpaired`` says.
+        """
+        candidates, rows = list(candidates), [np.zeros((0, 4), dtype=np.int64)]
+        for left, right in self._pairs(branches):
+            free = candidates[left], candidates[right]
+            found = branches.camera[left][free[0]], branches.camera[right][free[1]]
+            matched = pair_views(
+                branches.cameras[left],
+                branches.cameras[right],
+                *found,
+                gate_px=self.config.epipolar_gate_px,
+                check_depth=self.config.check_depth,
+                method="paper" if self.config.assignment == "paper" else "gated",
+            )
+            own, other = free[0][matched[:, 0]], free[1][matched[:, 1]]
+            left_first = found[0].scores[matched[:, 0]] >= found[1].scores[matched[:, 1]]
+            forward = np.stack([np.full(len(own), left), own, np.full(len(own), right), other], axis=1)
+            rows.append(np.where(left_first[:, None], forward, forward[:, [2, 3, 0, 1]]))
+            for camera, all_free, paired, kept in (
+                (left, free[0], own, left_first),
+                (right, free[1], other, ~left_first),
+            ):
+                alone = np.setdiff1d(all_free, paired)
+                if self.config.unpaired == "discard":
+                    self._mark(branches, camera, alone, Reason.UNPAIRED)
+                    alone = alone[:0]
+                candidates[camera] = np.sort(np.concatenate([paired[kept], alone]))
+        return candidates, np.concatenate(rows)
+
+    def _recover(
+        self,
+        frame: Frame,
+        branches: Branches,
+        clusters: Clusters,
+        views: Sequence[View],
+        matches: Matches,
+        outcome: ClusterOutcome,
+    ) -> tuple[Recovery, list[str]]:
+        """Detection recovery (section 4.2.3) of what nothing matched: pairs from both views."""
+        config = self.config
+        candidates = []
+        for c, (view, found) in enumerate(zip(views, branches.camera, strict=True)):
+            free = np.setdiff1d(np.flatnonzero(found.scores > config.decisive_score), view.match)
+            elsewhere = confirmed_elsewhere(views, matches, clusters, found.boxes[free], c, config.confirm_iou)
+            self._mark(branches, c, free[elsewhere], Reason.SEEN_ELSEWHERE)
+            candidates.append(free[~elsewhere])
+        notes: list[str] = []
+        points = None
+        if config.recovery and any(len(c) for c in candidates):
+            points = frame.points
+            if points is None:
+                notes.append("there is no scan: unmatched camera detections could not be recovered")
+        pairs = None
+        if points is None:
+            reason = Reason.NO_SCAN if config.recovery else Reason.NO_RECOVERY
+            for c, free in enumerate(candidates):
+                self._mark(branches, c, free, reason)
+            candidates = [free[:0] for free in candidates]
+            points = np.zeros((0, 4), np.float32)
+        else:
+            if not np.isfinite(points[:, :3]).all():
+                bad = int((~np.isfinite(points[:, :3]).all(axis=1)).sum())
+                notes.append(f"{bad} points of the scan are not finite and were not used")
+            candidates, pairs = self._pair_candidates(branches, candidates)
+        recovery = recover(
+            points,
+            branches.cameras,
+            branches.camera,
+            candidates,
+            self._confirmed(branches, outcome),
+            self.localizer,
+            enlargement=config.enlargement,
+            min_points=config.min_points,
+            mask_mode=config.mask_mode,
+            confirm_iou=config.confirm_iou,
+            duplicate_iou=config.duplicate_iou,
+            pairs=pairs,
+        )
+        _note_pairs(branches, recovery)
+        return recovery, notes
+
+
+def _rows(branches: Branches, camera: int, detections: IntArray) -> IntArray:
+    """Rows of the camera table of some detections of a camera that take part."""
+    rows: IntArray = branches.camera_start[camera] + branches.camera_index[camera][detections]
+    return rows
+
+
+def _prefer_confident_view(pair: _Pair, branches: Branches, views: Sequence[View], matches: Matches) -> None:
+    """Make the view of higher 2D score the primary match of clusters matched in both views of their primary pair."""
+    left, right = views[pair.left].match, views[pair.right].match
+    both = np.flatnonzero(np.isin(matches.camera, pair) & (left >= 0) & (right >= 0))
+    scores = branches.camera[pair.left].scores[left[both]], branches.camera[pair.right].scores[right[both]]
+    for camera, rows in ((pair.left, both[scores[0] >= scores[1]]), (pair.right, both[scores[0] < scores[1]])):
+        detection = views[camera].match[rows]
+        matches.camera[rows], matches.detection[rows] = camera, detection
+        matches.iou[rows] = views[camera].iou[rows, detection]
+
+
+def _note_pairs(branches: Branches, recovery: Recovery) -> None:
+    """Write into the camera table which detections are pairs of recovery, and the overlap in the second view."""
+    for first, second in ((c, c2) for c in range(len(branches.cameras)) for c2 in range(len(branches.cameras))):
+        here = (recovery.camera == first) & (recovery.second_camera == second)
+        rows = _rows(branches, first, recovery.detection[here])
+        other_rows = _rows(branches, second, recovery.second_detection[here])
+        table = branches.camera_table
+        table.pair[rows], table.pair[other_rows] = other_rows, rows
+        table.reason[other_rows], table.iou[other_rows] = Reason.SECOND_VIEW, recovery.second_iou[here]
+
+
+def _follow_first_views(table: Decisions) -> None:
+    """Give the second detection of every pair of recovery the fate of the first; name those that confirm together."""
+    confirming = (table.reason == Reason.OTHER_VIEW) & (table.pair >= 0)
+    following = np.flatnonzero((table.reason == Reason.SECOND_VIEW) & (table.pair >= 0))
+    first = table.pair[following]
+    for column in (table.stage, table.reason, table.score, table.output):
+        column[following] = column[first]
+    table.reason[confirming] = Reason.SECOND_VIEW
