@@ -17,8 +17,8 @@ from tests.localizers.scenes import SENSOR_HEIGHT, scan, standing
 
 
 def plane_at(cloud, x, y, expected=np.nan, radius=10.0):
-    plane = np.empty(3)
-    fit_plane(lowest_returns(cloud), x, y, radius, expected, plane)
+    plane = np.array([expected, 0, 0])
+    fit_plane(lowest_returns(cloud), x, y, radius, plane)
     return plane
 
 
@@ -29,11 +29,12 @@ def test_lowest_return_of_each_cell():
     cloud = np.vstack([cloud, [[1, 1, -np.inf]]]).astype(np.float32)
     grid = lowest_returns(cloud)
     i, j = int((1 + REACH) / CELL), int((1 + REACH) / CELL)
-    assert grid[i, j] == -2
-    assert grid[i + 1, j] == 0
-    assert np.isfinite(grid).sum() == 2
+    np.testing.assert_array_equal(grid[i, j], [1.5, 0.5, -2])
+    np.testing.assert_array_equal(grid[i + 1, j], [2.5, 1, 0])
+    assert np.isfinite(grid[..., 2]).sum() == 2
 
 
+@settings(deadline=None)
 @given(st.lists(st.floats(-5, 5), max_size=30))
 def test_ordered_sorts_a_copy(values):
     array = np.array(values)
@@ -45,8 +46,7 @@ def test_ordered_sorts_a_copy(values):
 @given(st.floats(-0.1, 0.1), st.floats(8, 25), st.floats(-5, 5))
 def test_slopes_are_found(slope, x, y):
     height, along, across = plane_at(scan([], slope=slope), x, y)
-    # a cell's lowest return lies downhill of its middle, so up to half a cell times the slope is lost
-    assert height == pytest.approx(-SENSOR_HEIGHT + slope * x, abs=0.05 + abs(slope) * CELL)
+    assert height == pytest.approx(-SENSOR_HEIGHT + slope * x, abs=0.1)
     assert along == pytest.approx(slope, abs=0.04)
     assert across == pytest.approx(0, abs=0.03)
 
@@ -69,10 +69,10 @@ def test_only_a_roof_hit_does_not_lift_the_ground():
     assert plane_at(cloud.astype(np.float32), 30, 0, expected=-1.7)[0] == pytest.approx(-1.7, abs=0.1)
 
 
-@pytest.mark.parametrize("slope", [-0.06, 0.0, 0.09])
+@pytest.mark.parametrize("slope", [0.0, 0.06, 0.12, 0.18])
 def test_ground_along_a_ray_follows_a_hill(slope):
     planes = np.empty((STATIONS, 3))
     ground_along(lowest_returns(scan([], slope=slope)), 0.2, -SENSOR_HEIGHT, planes)
-    for reach in (6.0, 12.0, 22.0):
+    for reach in (6.0, 12.0, 22.0, 45.0):
         a, b, _ = planes[station_of(reach)]
         assert a + b * reach == pytest.approx(-SENSOR_HEIGHT + slope * np.cos(0.2) * reach, abs=0.25)

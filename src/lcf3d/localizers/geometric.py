@@ -40,12 +40,14 @@ from lcf3d.localizers.fit import (
     search,
     solid_cost,
 )
-from lcf3d.localizers.ground import STATIONS, fit_plane, ground_along, lowest_returns, station_of
+from lcf3d.localizers.ground import RADIUS, STATIONS, fit_plane, ground_along, lowest_returns, station_of
 from lcf3d.localizers.shapes import SHAPES, ObjectShape
 from lcf3d.structures import FloatArray
 
 # fewest points of a cluster that a box is fitted to
 FEWEST_POINTS = 3
+# fits below this quality are none: points and 2D box show no object of the class together
+LEAST_QUALITY = 0.1
 # depth clusters tried in a frustum; the second must have this share of the first one's score
 CLUSTERS = 2
 SECOND_SHARE = 0.1
@@ -74,9 +76,10 @@ class GeometricLocalizer:
         self.shapes = dict(shapes)
 
     def __call__(self, proposals: FrustumProposals) -> tuple[FloatArray, FloatArray]:
-        """Boxes (K, 7) in the frustum frames, NaN where no cluster was found, and qualities (K,) in [0, 1].
+        """Boxes (K, 7) in the frustum frames, NaN where no object was found, and qualities (K,) in [0, 1].
 
-        The quality is high when points and 2D box agree with the box.
+        The quality is high when many points and the 2D box agree with the box. Since the fit makes the projection
+        agree with the 2D box, the image IoU alone says little about a box of this localizer.
         """
         count = len(proposals)
         boxes, quality = np.full((count, 7), np.nan), np.zeros(count)
@@ -139,7 +142,8 @@ def _localize_all(  # type: ignore[no-untyped-def]
 ):
     """Fill ``boxes`` (K, 7) and ``quality`` (K,) for all proposals of a frame."""
     around, planes, evidence = np.empty(3), np.empty((STATIONS, 3)), np.empty(EVIDENCE)
-    fit_plane(grid, 0.0, 0.0, 20.0, np.nan, around)
+    around[0], around[1], around[2] = np.nan, 0.0, 0.0
+    fit_plane(grid, 0.0, 0.0, 2.0 * RADIUS, around)
     for k in range(len(offsets) - 1):
         part, weight = points[offsets[k] : offsets[k + 1]], gaussian[offsets[k] : offsets[k + 1]]
         expected = around[0]
@@ -189,6 +193,9 @@ def _localize_one(points, gaussian, row, planes, projection, evidence, box):  # 
                 quality = _quality(q, taken[:used], evidence, count)
         hidden = int(max(window, 1.0) / BIN)
         profile[max(peak - hidden, 0) : peak + hidden + 1] = 0.0
+    if quality < LEAST_QUALITY:
+        box[:] = np.nan
+        return 0.0
     return quality
 
 
