@@ -165,7 +165,9 @@ def clip_segments(segments: FloatArray, bounds: tuple[float, float, float, float
             (-delta[:, axis], start[:, axis] - bounds[axis]),
             (delta[:, axis], bounds[axis + 2] - start[:, axis]),
         ):
-            t = np.divide(distance, direction, out=np.zeros(len(segments)), where=direction != 0)
+            # a direction next to zero may overflow: the parameter is then as good as infinite
+            with np.errstate(over="ignore"):
+                t = np.divide(distance, direction, out=np.zeros(len(segments)), where=direction != 0)
             enter = np.where(direction < 0, np.maximum(enter, t), enter)
             leave = np.where(direction > 0, np.minimum(leave, t), leave)
             outside |= (direction == 0) & (distance < 0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from pathlib import Path
 
 import numpy as np
@@ -175,6 +176,14 @@ def test_no_detections_and_several_images(tmp_path: Path, black: np.ndarray) -> 
     found = detector([black, np.zeros((30, 20, 3), dtype=np.uint8)])
     assert [len(f) for f in found] == [0, 0]
     assert detector([]) == []
+
+
+def test_detectors_travel_to_other_processes(tmp_path: Path, black: np.ndarray) -> None:
+    path = constant_graph(tmp_path / "m.onnx", {"out": yolox_output()}, IMAGE_INPUT)
+    detector = OnnxDetector(path, names=NAMES, threads=1)
+    other = pickle.loads(pickle.dumps(detector))
+    np.testing.assert_array_equal(other([black])[0].boxes, detector([black])[0].boxes)
+    assert len(other([black])[0]) == 1
 
 
 def test_names_from_a_file(tmp_path: Path) -> None:
