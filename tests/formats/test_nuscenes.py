@@ -195,6 +195,21 @@ def test_other_classes_are_dropped_and_attributes_filled_in() -> None:
     assert [NUSCENES_CLASSES[label] for label in boxes.labels] == ["pedestrian", "car"]
     assert [NUSCENES_ATTRIBUTES[a] for a in boxes.attributes] == ["pedestrian.standing", "vehicle.parked"]
     assert np.isnan(boxes.velocities).all()
+    changed = Detections3D(
+        found.boxes,
+        found.scores,
+        [5, 7, 8],
+        NUSCENES_CLASSES,
+        attributes=["vehicle.parked", "cycle.with_rider", "vehicle.moving"],
+    )
+    boxes = global_from_detections({"s": changed}, {"s": np.eye(4)})
+    assert [NUSCENES_ATTRIBUTES[a] if a >= 0 else "" for a in boxes.attributes] == [
+        "pedestrian.moving",
+        "cycle.with_rider",
+        "",
+    ]
+    with pytest.raises(FormatError, match="none of the classes Car, Van is a nuScenes class"):
+        global_from_detections({"s": Detections3D.empty(("Car", "Van"))}, {"s": np.eye(4)})
     assert len(global_from_detections({}, {}, ("s",))) == len(empty_global(("s",))) == 0
 
 

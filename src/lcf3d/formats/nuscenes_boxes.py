@@ -29,6 +29,17 @@ NUSCENES_ATTRIBUTES = (
 )
 """Names that attribute indices stand for; -1 stands for none."""
 
+_CLASSES = frozenset(NUSCENES_CLASSES)
+# first part of the attributes that a class may have
+_KIND_OF_CLASS = {
+    **dict.fromkeys(NUSCENES_CLASSES, "vehicle"),
+    "pedestrian": "pedestrian",
+    "motorcycle": "cycle",
+    "bicycle": "cycle",
+    "traffic_cone": "",
+    "barrier": "",
+}
+
 MOVING_SPEED = 0.2
 """Speed in m/s above which a default attribute says that an object moves."""
 
@@ -122,7 +133,7 @@ def global_from_detections(
 ) -> GlobalBoxes:
     """Detections of many samples in the global frame; the inverse of `detections_from_global`.
 
-    Boxes are written upright. Unknown velocities become 0 and missing attributes those of `default_attributes`.
+    Boxes are written upright. Attributes that are missing, or are none of the class, become `default_attributes`.
     Classes other than the ten of nuScenes are dropped.
 
     Args:
@@ -131,13 +142,18 @@ def global_from_detections(
         sample_tokens: every token to list (default: those of ``detections``).
 
     Raises:
-        FormatError: detections of a sample that ``sample_tokens`` does not list.
+        FormatError: detections of a sample that ``sample_tokens`` does not list, or of no nuScenes class at all.
     """
     tokens = tuple(detections if sample_tokens is None else sample_tokens)
     index = {token: i for i, token in enumerate(tokens)}
     unknown = [token for token in detections if token not in index]
     if unknown:
         raise FormatError(f"detections of sample {unknown[0]} (and {len(unknown) - 1} more) are not of this dataset")
+    foreign = [names for names in {found.class_names for found in detections.values()} if not set(names) & _CLASSES]
+    if foreign:
+        raise FormatError(
+            f"none of the classes {', '.join(foreign[0])} is a nuScenes class; map them with Detections3D.with_classes"
+        )
     parts = [
         _global_from_one(tokens, index[token], found.with_classes(NUSCENES_CLASSES), global_from_lidar[token])
         for token, found in detections.items()
@@ -216,7 +232,10 @@ def _global_from_one(
     if detections.attributes is not None:
         index = {name: i for i, name in enumerate(NUSCENES_ATTRIBUTES)}
         given = np.array([index.get(str(name), -1) for name in detections.attributes], dtype=np.int64).reshape(n)
-        attributes = np.where(given >= 0, given, attributes)
+        # a camera may have changed the class since: a pedestrian is not parked
+        kinds = np.array([_KIND_OF_CLASS[name] for name in NUSCENES_CLASSES])[detections.labels]
+        kinds_given = np.array([*(name.split(".")[0] for name in NUSCENES_ATTRIBUTES), "none"])[given]
+        attributes = np.where(kinds_given == kinds, given, attributes)
     return GlobalBoxes(
         tokens,
         np.full(n, sample, dtype=np.int64),
