@@ -1,15 +1,15 @@
 """Score calibration: what a score of a detector means as a probability, by class and branch, in one JSON file.
 
 Fitted on labelled frames by ``lcf3d calibrate`` (`lcf3d.fusion.calibration_fit`), or without labels on a run's own
-frames with the camera as teacher (`self_calibration`).
+frames with the camera as teacher (`lcf3d.fusion.self_calibration`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Literal, NamedTuple, TypeVar
+from typing import Annotated, Literal, TypeVar
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
@@ -17,7 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from lcf3d.errors import ConfigError
 from lcf3d.formats.files import read_json, write_text
 from lcf3d.fusion.evidence import MAX_LOG_ODDS, Evidence, to_probability
-from lcf3d.structures import BoolArray, Detections2D, Detections3D, FloatArray
+from lcf3d.structures import Detections2D, Detections3D, FloatArray
 
 Transform = Literal["identity", "log", "logit"]
 Detections = TypeVar("Detections", Detections2D, Detections3D)
@@ -159,7 +159,7 @@ def _with_probabilities(detections: Detections, maps: Mapping[str, ScoreMap]) ->
 
 
 def load_calibration(text: str) -> Calibration | None:
-    """What ``--calibration`` names: a file, or ``none``. ``auto`` needs the run's frames: see `self_calibration`.
+    """What ``--calibration`` names: a file, or ``none``. ``auto`` needs the run's frames: see `self_calibrate`.
 
     Raises:
         Lcf3dError: the file is absent or malformed.
@@ -167,51 +167,8 @@ def load_calibration(text: str) -> Calibration | None:
     if text == "none":
         return None
     if text == "auto":
-        raise ConfigError("'auto' calibrates on the frames of a run: use self_calibration")
+        raise ConfigError("'auto' calibrates on the frames of a run: see lcf3d.fusion.self_calibration")
     return Calibration.load(text)
-
-
-class Observation(NamedTuple):
-    """What self-calibration needs to know of one class over a run's frames.
-
-    Attributes:
-        scores: (N,) of all LiDAR boxes of the class.
-        confirmed: (N,) which of them a confident camera detection of the class confirms.
-        judged: (N,) which of them a camera looked at; none if the camera does not detect the class.
-        bottoms: (N,) heights of the undersides of the boxes, LiDAR frame, metres.
-    """
-
-    scores: FloatArray
-    confirmed: BoolArray
-    judged: BoolArray
-    bottoms: FloatArray
-
-
-def self_calibration(observations: Mapping[str, Observation], camera_classes: Sequence[str]) -> Calibration:
-    """A calibration without labels, on a run's own frames, with the camera as teacher.
-
-    The probability that a box is right is taken to be the probability that the camera confirms it, a Platt line with a
-    prior that holds it near a logistic of robustly standardised scores when there is little to see. Works on a handful
-    of frames and on thousands, and gives the same numbers every time.
-
-    Args:
-        observations: by class.
-        camera_classes: classes that the camera branch detected anywhere in the run.
-    """
-    maps = {
-        name: _self_map(seen.scores, seen.confirmed, seen.judged)
-        for name, seen in observations.items()
-        if len(seen.scores)
-    }
-    bottoms = [
-        observations[name].bottoms[score_map(observations[name].scores) > 0.5] for name, score_map in maps.items()
-    ]
-    return Calibration(
-        source="the run's own frames, with the camera as teacher (no labels)",
-        lidar=maps,
-        camera_classes=tuple(camera_classes),
-        ground_z=ground_height(np.concatenate([np.zeros(0), *bottoms])),
-    )
 
 
 def ground_height(bottoms: FloatArray) -> float | None:
@@ -219,26 +176,8 @@ def ground_height(bottoms: FloatArray) -> float | None:
     return float(np.median(bottoms)) if len(bottoms) else None
 
 
-def _self_map(scores: FloatArray, confirmed: BoolArray, judged: BoolArray) -> ScoreMap:
-    """Platt line of confirmation on score; scores in [0, 1] get a line on their logit."""
-    from lcf3d.fusion.calibration_fit import fit_platt
-
-    transform = natural_transform(scores)
-    x = transform_scores(scores, transform)
-    prior = _standardising_line(x) if transform != "logit" else (1.0, 0.0)
-    slope, intercept = fit_platt(x[judged], confirmed[judged].astype(np.float64), prior=prior, strength=10.0)
-    return ScoreMap(transform=transform, slope=slope, intercept=intercept)
-
-
 def natural_transform(scores: FloatArray) -> Transform:
     """``logit`` for scores in [0, 1], ``log`` for wide positive ones, ``identity`` (logits) for others."""
     if scores.min() >= 0 and scores.max() <= 1:
         return "logit"
     return "log" if scores.min() >= 0 else "identity"
-
-
-def _standardising_line(x: FloatArray) -> tuple[float, float]:
-    """(slope, intercept) that put the median at even odds and the quartiles about one unit of log-odds from it."""
-    low, middle, high = np.quantile(x, (0.25, 0.5, 0.75))
-    spread = max(float(high - low) / 2, 0.25)
-    return 1 / spread, -float(middle) / spread

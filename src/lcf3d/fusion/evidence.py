@@ -46,11 +46,11 @@ class Evidence(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    base: float = -0.4
+    base: float = -0.6
     trust: Weight = 0.8
-    support: tuple[Weight, Weight, Weight, Weight] = (0.0, 0.3, 1.1, 2.8)
-    miss: Weight = 0.0
-    off_ground: Weight = 2.1
+    support: tuple[Weight, Weight, Weight, Weight] = (0.1, 0.5, 1.3, 3.0)
+    miss: Weight = 0.1
+    off_ground: Weight = 2.0
     rival: Weight = 0.0
 
     @model_validator(mode="after")

@@ -1,0 +1,115 @@
+"""Calibration without labels: the camera branch teaches what the scores of the LiDAR branch mean.
+
+``lcf3d run --calibration auto`` uses it. It puts scores of any scale into (0, 1) and finds out which classes the camera
+branch detects and where the ground is; the evidence weights stay those of the settings.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import numpy as np
+
+from lcf3d.fusion.calibration import (
+    Calibration,
+    ScoreMap,
+    Transform,
+    ground_height,
+    natural_transform,
+    transform_scores,
+)
+from lcf3d.fusion.calibration_fit import fit_platt
+from lcf3d.fusion.config import FusionConfig
+from lcf3d.fusion.matching import assign
+from lcf3d.geometry.camera import project_boxes
+from lcf3d.geometry.iou import image_iou
+from lcf3d.structures import BoolArray, Detections2D, Detections3D, FloatArray, Frame, IntArray
+
+# 2D detections above this score teach
+TEACHER_SCORE = 0.5
+# weight of the prior line, in detections
+PRIOR_STRENGTH = 20.0
+
+FrameDetections = tuple[Frame, Detections3D, Detections2D]
+
+
+class _Observed(NamedTuple):
+    """LiDAR boxes of many frames: label, score, underside, seen by the camera, confirmed by a 2D detection."""
+
+    labels: IntArray
+    scores: FloatArray
+    bottoms: FloatArray
+    visible: BoolArray
+    confirmed: BoolArray
+
+
+def self_calibrate(frames: Iterable[FrameDetections], config: FusionConfig) -> Calibration:
+    """A calibration fitted without labels on the frames of a run.
+
+    A box's probability of being right is taken to be its probability of being confirmed: of having a 2D detection of
+    its class with a score above ``TEACHER_SCORE`` and an image IoU above ``match_iou``, one to one. That is a Platt
+    line by class, pulled towards a logistic of robustly standardised scores, which is what remains when there are few
+    boxes or when the camera does not detect the class. Scores of a class that lie in [0, 1] are left as they are.
+
+    Args:
+        frames: each frame with its LiDAR detections and those of its first camera.
+        config: settings.
+
+    Returns:
+        A `Calibration` without evidence weights; the same for the same frames, whatever their order.
+    """
+    parts, camera_labels = [], np.zeros(len(config.class_names), dtype=bool)
+    for frame, lidar, camera in frames:
+        found = camera.with_classes(config.class_names)
+        camera_labels[found.labels] = True
+        parts.append(_observe(frame, lidar.with_classes(config.class_names), found, config))
+    if not parts:
+        return Calibration(source=_SOURCE)
+    seen = _Observed(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+    maps: dict[str, ScoreMap] = {}
+    probability = seen.scores.copy()
+    for label, name in enumerate(config.class_names):
+        own = seen.labels == label
+        if not own.any() or natural_transform(seen.scores[own]) == "logit":
+            continue
+        taught = seen.visible[own] & camera_labels[label]
+        maps[name] = _taught_map(seen.scores[own], seen.confirmed[own], taught)
+        probability[own] = maps[name](seen.scores[own])
+    return Calibration(
+        source=_SOURCE,
+        lidar=maps,
+        camera_classes=tuple(name for name, there in zip(config.class_names, camera_labels, strict=True) if there),
+        ground_z=ground_height(seen.bottoms[probability > TEACHER_SCORE]),
+    )
+
+
+_SOURCE = "the frames of a run, without labels, with the camera as teacher"
+
+
+def _observe(frame: Frame, lidar: Detections3D, camera: Detections2D, config: FusionConfig) -> _Observed:
+    """The boxes of one frame."""
+    confirmed, visible = np.zeros(len(lidar), dtype=bool), np.zeros(len(lidar), dtype=bool)
+    if frame.cameras and len(lidar):
+        projected, visible = project_boxes(lidar.boxes, frame.cameras[0])
+        teachers = camera[camera.scores > TEACHER_SCORE]
+        overlap = image_iou(projected, teachers.boxes)
+        overlap[lidar.labels[:, None] != teachers.labels[None]] = 0
+        confirmed = assign(overlap, config.match_iou) >= 0
+    bottoms = lidar.boxes[:, 2] - lidar.boxes[:, 5] / 2
+    return _Observed(lidar.labels, lidar.scores, bottoms, visible, confirmed)
+
+
+def _taught_map(scores: FloatArray, confirmed: BoolArray, taught: BoolArray) -> ScoreMap:
+    """The Platt line of confirmation on score; scores in any order give the same."""
+    order = np.lexsort((confirmed, taught, scores))
+    scores, confirmed, taught = scores[order], confirmed[order], taught[order]
+    transform: Transform = natural_transform(scores)
+    x = transform_scores(scores, transform)
+    low, middle, high = np.quantile(x, (0.25, 0.5, 0.75))
+    # the median at even odds, the quartiles one unit of log-odds away
+    prior = 1 / max(float(high - low) / 2, 0.25)
+    slope, intercept = fit_platt(
+        x[taught], confirmed[taught].astype(np.float64), prior=(prior, -prior * float(middle)), strength=PRIOR_STRENGTH
+    )
+    return ScoreMap(transform=transform, slope=slope, intercept=intercept)
