@@ -78,7 +78,8 @@ def to_classes(
 
     Args:
         detections: of any detector; COCO-like ones (with a class ``person``) pass through `join_riders`.
-        class_names: target classes, for example `KITTI_CLASSES` or `NUSCENES_CLASSES`.
+        class_names: target classes, for example `KITTI_CLASSES` or `NUSCENES_CLASSES`; where the detections have just
+            these already, they are returned as they are.
         mapping: source name -> target name, on top of `class_mapping`; an empty target name drops the class.
 
     Returns:

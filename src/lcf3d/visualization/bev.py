@@ -83,6 +83,8 @@ def draw_bev(
         RGB picture.
     """
     canvas = Canvas(_point_picture(points, view))
+    if points is None:
+        canvas.text(6, 4, "no scan", _RING_TEXT)
     _draw_rings(canvas, view)
     for camera in cameras:
         canvas.lines(_field_of_view(camera, view), _VIEW, width=1.0)

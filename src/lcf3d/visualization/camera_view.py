@@ -75,8 +75,10 @@ def draw_camera(
         if background.size != (camera.width, camera.height):
             background = background.resize((camera.width, camera.height), PIL.Image.Resampling.LANCZOS)
     canvas = Canvas(background)
+    if image is None:
+        title = f"{camera.name}: no image"
     if title:
-        canvas.text(6, 4, title if image is not None else f"{title} (no image)", (255, 255, 255), plate=True)
+        canvas.text(6, 4, title, (255, 255, 255), plate=True)
     _draw_truth(canvas, camera, scene)
     _draw_boxes(canvas, camera, scene)
     _draw_image_boxes(canvas, camera, scene, scale)

@@ -246,6 +246,19 @@ def test_override_that_does_not_fit(tmp_path: Path, black: np.ndarray) -> None:
         detector([black])
 
 
+def test_boxes_labels_and_scores_without_a_batch(tmp_path: Path, black: np.ndarray) -> None:
+    outputs = {
+        "boxes": np.zeros((5, 4), dtype=np.float32),
+        "labels": np.zeros(5, dtype=np.int64),
+        "scores": np.zeros(5, dtype=np.float32),
+    }
+    path = constant_graph(tmp_path / "m.onnx", outputs, IMAGE_INPUT)
+    with pytest.raises(DetectorError, match="not a usable camera detector"):
+        OnnxDetector(path)
+    with pytest.raises(DetectorError, match="layout detr expects labels 1 x N"):
+        OnnxDetector(path, layout="detr")([black])
+
+
 def test_unknown_class_index(tmp_path: Path, black: np.ndarray) -> None:
     output = np.array([[[24, 24, 40, 40, 0.9, 7]]], dtype=np.float32)
     path = constant_graph(tmp_path / "m.onnx", {"out": output}, IMAGE_INPUT)

@@ -88,7 +88,7 @@ def identify_layout(
     Raises:
         DetectorError: they fit none.
     """
-    if {"labels", "boxes", "scores"} <= set(output_shapes):
+    if {"labels", "boxes", "scores"} <= set(output_shapes) and len(output_shapes["boxes"]) == 3:
         return "detr"
     shapes = list(output_shapes.values())
     masks = shapes[1][1] if len(shapes) > 1 and len(shapes[1]) == 4 else 0
@@ -160,7 +160,10 @@ def decode_end2end(outputs: Sequence[NDArray[Any]], size: tuple[int, int], lowes
 
 def decode_detr(outputs: Sequence[NDArray[Any]], size: tuple[int, int], lowest: float) -> RawDetections:
     """Labels, corners and scores of the queries; the runner names the input size as the original size."""
-    labels, boxes, scores = (np.asarray(output)[0] for output in outputs)
+    shapes = [list(output.shape) for output in outputs]
+    if [len(shape) for shape in shapes] != [2, 3, 2]:
+        raise DetectorError(f"layout detr expects labels 1 x N, boxes 1 x N x 4 and scores 1 x N, got {shapes}")
+    labels, boxes, scores = (output[0] for output in outputs)
     kept = scores >= lowest
     return RawDetections(boxes[kept].astype(np.float64), scores[kept].astype(np.float64), labels[kept].astype(np.int64))
 
