@@ -158,7 +158,7 @@ def table(rows: list[Row]) -> list[list[str]]:
                 f"{(iou > 0.7).mean():.2f}",
                 f"{np.median([r.bev_iou for r in chosen]):.3f}",
                 f"{np.median([r.centre_error for r in chosen]):.2f}",
-                f"{np.median([r.yaw_error_deg for r in chosen]):.1f}",
+                f"{np.nanmedian([r.yaw_error_deg for r in chosen]):.1f}",
                 f"{np.mean([r.image_iou > CONFIRMED for r in chosen]):.2f}",
             )
             lines.append([name, reach, str(len(chosen)), *figures])
