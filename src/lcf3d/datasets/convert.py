@@ -206,54 +206,9 @@ def _append_sample(
     intensity_scale: float,
 ) -> None:
     """Add one frame to the tables and write its sensor files."""
-    scene = _token("scene", frame.id)
-    tables["scene"].append(
-        {
-            "token": scene,
-            "log_token": _token("log"),
-            "nbr_samples": 1,
-            "first_sample_token": token,
-            "last_sample_token": token,
-            "name": f"scene-{frame.id}",
-            "description": "",
-        }
-    )
-    tables["sample"].append({"token": token, "timestamp": timestamp_us, "prev": "", "next": "", "scene_token": scene})
-    pose = _token("ego_pose", frame.id)
-    tables["ego_pose"].append(
-        {"token": pose, "timestamp": timestamp_us, "rotation": [1.0, 0.0, 0.0, 0.0], "translation": [0.0, 0.0, 0.0]}
-    )
-
-    def add(channel: str, ego_from_sensor: FloatArray, intrinsics: list[Any], size: tuple[int, int], name: str) -> None:
-        calibration = _token("calibrated_sensor", frame.id, channel)
-        tables["calibrated_sensor"].append(
-            {
-                "token": calibration,
-                "sensor_token": _token("sensor", channel),
-                "translation": ego_from_sensor[:3, 3].tolist(),
-                "rotation": quaternions_from_matrices(ego_from_sensor[None, :3, :3])[0].tolist(),
-                "camera_intrinsic": intrinsics,
-            }
-        )
-        tables["sample_data"].append(
-            {
-                "token": _token("sample_data", frame.id, channel),
-                "sample_token": token,
-                "ego_pose_token": pose,
-                "calibrated_sensor_token": calibration,
-                "timestamp": timestamp_us,
-                "fileformat": name.rsplit(".", 1)[-1],
-                "is_key_frame": True,
-                "width": size[0],
-                "height": size[1],
-                "filename": name,
-                "prev": "",
-                "next": "",
-            }
-        )
-
+    _append_scene(tables, frame.id, token, timestamp_us)
     scan = f"samples/{LIDAR}/{frame.id}.pcd.bin"
-    add(LIDAR, invert_rigid(RAW_FROM_CANONICAL), [], (0, 0), scan)
+    _append_recording(tables, frame.id, token, timestamp_us, LIDAR, invert_rigid(RAW_FROM_CANONICAL), scan)
     points = frame.points
     if points is not None:
         raw = np.stack([-points[:, 1], points[:, 0], points[:, 2], points[:, 3] * intensity_scale], axis=1)
@@ -263,12 +218,76 @@ def _append_sample(
             continue
         channel = cameras[camera.name]
         image = f"samples/{channel}/{frame.id}.png"
-        intrinsics, camera_from_lidar = _without_offset(camera)
-        add(channel, invert_rigid(camera_from_lidar), intrinsics.tolist(), (camera.width, camera.height), image)
+        ego_from_camera = invert_rigid(_without_offset(camera))
+        _append_recording(tables, frame.id, token, timestamp_us, channel, ego_from_camera, image, camera)
         if camera.name in frame.images:
             _write_png(root / image, frame.images[camera.name])
     if frame.labels is not None:
         _append_annotations(tables, frame.id, token, nuscenes_labels(frame.labels), points)
+
+
+def _append_scene(tables: dict[str, list[dict[str, Any]]], id: str, token: str, timestamp_us: int) -> None:
+    """Add a scene of one sample, and the vehicle's pose: its frame is the global one."""
+    scene = _token("scene", id)
+    tables["scene"].append(
+        {
+            "token": scene,
+            "log_token": _token("log"),
+            "nbr_samples": 1,
+            "first_sample_token": token,
+            "last_sample_token": token,
+            "name": f"scene-{id}",
+            "description": "",
+        }
+    )
+    tables["sample"].append({"token": token, "timestamp": timestamp_us, "prev": "", "next": "", "scene_token": scene})
+    tables["ego_pose"].append(
+        {
+            "token": _token("ego_pose", id),
+            "timestamp": timestamp_us,
+            "rotation": [1.0, 0.0, 0.0, 0.0],
+            "translation": [0.0, 0.0, 0.0],
+        }
+    )
+
+
+def _append_recording(
+    tables: dict[str, list[dict[str, Any]]],
+    id: str,
+    token: str,
+    timestamp_us: int,
+    channel: str,
+    ego_from_sensor: FloatArray,
+    filename: str,
+    camera: Camera | None = None,
+) -> None:
+    """Add one sensor's calibration and key frame."""
+    calibration = _token("calibrated_sensor", id, channel)
+    tables["calibrated_sensor"].append(
+        {
+            "token": calibration,
+            "sensor_token": _token("sensor", channel),
+            "translation": ego_from_sensor[:3, 3].tolist(),
+            "rotation": quaternions_from_matrices(ego_from_sensor[None, :3, :3])[0].tolist(),
+            "camera_intrinsic": [] if camera is None else camera.intrinsics.tolist(),
+        }
+    )
+    tables["sample_data"].append(
+        {
+            "token": _token("sample_data", id, channel),
+            "sample_token": token,
+            "ego_pose_token": _token("ego_pose", id),
+            "calibrated_sensor_token": calibration,
+            "timestamp": timestamp_us,
+            "fileformat": filename.rsplit(".", 1)[-1],
+            "is_key_frame": True,
+            "width": 0 if camera is None else camera.width,
+            "height": 0 if camera is None else camera.height,
+            "filename": filename,
+            "prev": "",
+            "next": "",
+        }
+    )
 
 
 def _append_annotations(
@@ -315,14 +334,14 @@ def _append_annotations(
         )
 
 
-def _without_offset(camera: Camera) -> tuple[FloatArray, FloatArray]:
-    """Camera matrix (3, 3) and ``camera_from_lidar`` of the same projection ``P = K [I | 0]``.
+def _without_offset(camera: Camera) -> FloatArray:
+    """``camera_from_lidar`` (4, 4) with which ``P = K [I | 0]`` projects as the camera's own ``P`` does.
 
     KITTI's projections hold the stereo baseline in their last column; nuScenes has no place for it but the pose.
     """
     transform = np.array(camera.camera_from_lidar)
     transform[:3, 3] += np.linalg.solve(camera.intrinsics, camera.projection[:, 3])
-    return camera.intrinsics, transform
+    return transform
 
 
 def _token(*parts: object) -> str:

@@ -182,73 +182,90 @@ def _column(path: Path, records: list[dict[str, Any]], key: str, spec: _Spec) ->
     return column.reshape(len(records), *shape)
 
 
-def _read_sensor_data(reader: _Reader, sample_index: _TokenIndex) -> SensorData:
+@dataclass(frozen=True, eq=False)
+class _Calibrations:
+    """Columns of ``calibrated_sensor.json``, with the number of each sensor in `CHANNELS` (-1 for others)."""
+
+    index: _TokenIndex
+    tokens: Tokens
+    channels: IntArray
+    rotations: FloatArray
+    translations: FloatArray
+    intrinsics: FloatArray
+
+
+def _read_calibrations(reader: _Reader) -> _Calibrations:
     sensor = reader.columns("sensor", {"token": _TEXT, "channel": _TEXT})
     intrinsic: _Spec = (lambda value: value or [[np.nan] * 3] * 3, np.float64, (3, 3))
-    calibration = reader.columns(
+    table = reader.columns(
         "calibrated_sensor",
         {
-            "token": _TEXT,
-            "sensor_token": _TEXT,
+            **dict.fromkeys(("token", "sensor_token"), _TEXT),
             "translation": _VECTOR,
             "rotation": _QUATERNION,
             "camera_intrinsic": intrinsic,
         },
     )
-    calibration_index = reader.index("calibrated_sensor", calibration["token"])
-    reader.require_unit("calibrated_sensor", calibration["token"], calibration["rotation"])
-    sensor_rows = reader.resolve(
-        reader.index("sensor", sensor["token"]),
-        calibration["sensor_token"],
-        "calibrated_sensor",
-        calibration["token"],
-        "sensor",
-    )
+    own = table["token"]
+    index = reader.index("calibrated_sensor", own)
+    reader.require_unit("calibrated_sensor", own, table["rotation"])
+    sensor_index = reader.index("sensor", sensor["token"])
+    sensor_rows = reader.resolve(sensor_index, table["sensor_token"], "calibrated_sensor", own, "sensor")
     numbers = {channel.encode(): i for i, channel in enumerate(CHANNELS)}
     # other sensors get -1, dangling ones too: they have been noted above
     channel_of_sensor = np.array([*(numbers.get(name, -1) for name in sensor["channel"].tolist()), -1], dtype=np.int64)
-    channels = channel_of_sensor[sensor_rows]
-    channel_by_token = dict(zip((t.decode() for t in calibration["token"].tolist()), channels.tolist(), strict=True))
+    return _Calibrations(
+        index,
+        own,
+        channel_of_sensor[sensor_rows],
+        table["rotation"],
+        table["translation"],
+        table["camera_intrinsic"],
+    )
+
+
+def _read_recordings(reader: _Reader, calibrations: _Calibrations) -> dict[str, NDArray[Any]]:
+    """Columns of ``sample_data.json``: LiDAR recordings, and key frames of the cameras."""
     lidar = CHANNELS.index(LIDAR)
+    tokens = (token.decode() for token in calibrations.tokens.tolist())
+    channel_by_token = dict(zip(tokens, calibrations.channels.tolist(), strict=True))
 
     def wanted(record: dict[str, Any]) -> bool:
         # a dangling calibration token passes, to be noted
         channel = channel_by_token.get(record["calibrated_sensor_token"], lidar)
         return channel == lidar or (channel >= 0 and bool(record["is_key_frame"]))
 
+    specs: dict[str, _Spec] = {
+        **dict.fromkeys(("token", "sample_token", "ego_pose_token", "calibrated_sensor_token", "prev"), _TEXT),
+        **dict.fromkeys(("timestamp", "width", "height"), (lambda value: value or 0, np.int64, ())),
+        "filename": _TEXT,
+        "is_key_frame": (None, np.bool_, ()),
+    }
     try:
-        data = reader.columns(
-            "sample_data",
-            {
-                **dict.fromkeys(("token", "sample_token", "ego_pose_token", "calibrated_sensor_token", "prev"), _TEXT),
-                **dict.fromkeys(("timestamp", "width", "height"), (lambda value: value or 0, np.int64, ())),
-                "filename": _TEXT,
-                "is_key_frame": (None, np.bool_, ()),
-            },
-            wanted,
-        )
+        return reader.columns("sample_data", specs, wanted)
     except KeyError as error:
         raise DatasetError(f"{reader.folder / 'sample_data.json'}: a record has no {error.args[0]!r}") from None
+
+
+def _read_sensor_data(reader: _Reader, sample_index: _TokenIndex) -> SensorData:
+    calibrations = _read_calibrations(reader)
+    data = _read_recordings(reader, calibrations)
     own = data["token"]
-    calibrations = reader.resolve(
-        calibration_index, data["calibrated_sensor_token"], "sample_data", own, "calibrated_sensor"
-    )
-    rows = reader.resolve(sample_index, data["sample_token"], "sample_data", own, "sample")
+    rows = reader.resolve(calibrations.index, data["calibrated_sensor_token"], "sample_data", own, "calibrated_sensor")
+    samples = reader.resolve(sample_index, data["sample_token"], "sample_data", own, "sample")
     pose_rotations, pose_translations = _read_poses(reader, data["ego_pose_token"], own)
-    channel = np.append(channels, -1)[calibrations]
+    channel = np.append(calibrations.channels, -1)[rows]
     previous = np.full(len(own), -1, dtype=np.int64)
-    is_lidar = channel == lidar
-    own_index = reader.index("sample_data", own)
+    is_lidar = channel == CHANNELS.index(LIDAR)
     previous[is_lidar] = reader.resolve(
-        own_index, data["prev"][is_lidar], "sample_data", own[is_lidar], "prev", optional=True
+        reader.index("sample_data", own), data["prev"][is_lidar], "sample_data", own[is_lidar], "prev", optional=True
     )
-    camera = (channel >= 0) & ~is_lidar
-    known = np.isfinite(calibration["camera_intrinsic"]).all(axis=(1, 2))[calibrations]
-    for i in np.flatnonzero(camera & ~(known & (data["width"] > 0) & (data["height"] > 0))):
+    known = np.isfinite(calibrations.intrinsics).all(axis=(1, 2))[rows] & (data["width"] > 0) & (data["height"] > 0)
+    for i in np.flatnonzero((channel >= 0) & ~is_lidar & ~known):
         reader.error("NUS06", f"sample_data.json: image {own[i].decode()} has no camera_intrinsic, width or height")
     return SensorData(
         own,
-        rows,
+        samples,
         channel,
         data["timestamp"],
         data["is_key_frame"],
@@ -257,9 +274,9 @@ def _read_sensor_data(reader: _Reader, sample_index: _TokenIndex) -> SensorData:
         previous,
         pose_rotations,
         pose_translations,
-        calibration["rotation"][calibrations],
-        calibration["translation"][calibrations],
-        calibration["camera_intrinsic"][calibrations],
+        calibrations.rotations[rows],
+        calibrations.translations[rows],
+        calibrations.intrinsics[rows],
     )
 
 
