@@ -260,7 +260,8 @@ def _read_sensor_data(reader: _Reader, sample_index: _TokenIndex) -> SensorData:
     previous[is_lidar] = reader.resolve(
         reader.index("sample_data", own), data["prev"][is_lidar], "sample_data", own[is_lidar], "prev", optional=True
     )
-    known = np.isfinite(calibrations.intrinsics).all(axis=(1, 2))[rows] & (data["width"] > 0) & (data["height"] > 0)
+    finite = np.asarray(np.isfinite(calibrations.intrinsics).all(axis=(1, 2)), dtype=bool)
+    known = finite[rows] & (data["width"] > 0) & (data["height"] > 0)
     for i in np.flatnonzero((channel >= 0) & ~is_lidar & ~known):
         reader.error("NUS06", f"sample_data.json: image {own[i].decode()} has no camera_intrinsic, width or height")
     return SensorData(

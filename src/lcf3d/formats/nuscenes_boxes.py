@@ -101,6 +101,10 @@ class GlobalBoxes:
             self.point_counts[index],
         )
 
+    def in_samples(self, sample_tokens: Sequence[str], sample: int) -> GlobalBoxes:
+        """The same boxes, all as boxes of ``sample_tokens[sample]``."""
+        return replace(self, sample_tokens=tuple(sample_tokens), samples=np.full(len(self), sample, dtype=np.int64))
+
 
 def detections_from_global(boxes: GlobalBoxes, lidar_from_global: FloatArray) -> Detections3D:
     """Boxes of one sample in its canonical LiDAR frame.
@@ -257,5 +261,5 @@ def split_by_sample(boxes: GlobalBoxes) -> dict[str, GlobalBoxes]:
     result = {}
     for i, token in enumerate(boxes.sample_tokens):
         part = boxes[order[(ends[i - 1] if i else 0) : ends[i]]]
-        result[token] = replace(part, sample_tokens=(token,), samples=np.zeros(len(part), dtype=np.int64))
+        result[token] = part.in_samples((token,), 0)
     return result
