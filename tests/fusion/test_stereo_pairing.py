@@ -167,7 +167,12 @@ def test_exchanged_detections_are_refused():
     objects = [car(12, 2), car(18, -3), car(25, 4)]
     left, right = (seen(v, objects, [0.9] * 3) for v in views)
     check_not_exchanged(*views, left, right, 10.0)
-    with pytest.raises(Lcf3dError, match="all 3 objects seen in both views would lie behind"):
-        check_not_exchanged(*views, right, left, 3.0)
-    # two objects may be chance
-    check_not_exchanged(*views, right[:2], left[:2], 3.0)
+    with pytest.raises(Lcf3dError, match="no object in common, but 3 with the views exchanged"):
+        check_not_exchanged(*views, right, left, 10.0)
+    # two objects may be chance, and so far away that disparity says nothing they fit both ways
+    check_not_exchanged(*views, right[:2], left[:2], 10.0)
+    far = replace(
+        right, boxes=np.concatenate([right.boxes, [[500.0, 190, 512, 196]]]), scores=[0.9] * 4, labels=[0] * 4
+    )
+    also = replace(left, boxes=np.concatenate([left.boxes, [[501.0, 190, 513, 196]]]), scores=[0.9] * 4, labels=[0] * 4)
+    check_not_exchanged(*views, far, also, 10.0)

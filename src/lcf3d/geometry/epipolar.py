@@ -22,7 +22,8 @@ def camera_centre(camera: Camera) -> FloatArray:
         ConfigError: its projection has no centre (a singular left 3 x 3 part).
     """
     matrix = camera.pixels_from_lidar[:, :3]
-    if np.linalg.matrix_rank(matrix) < 3:
+    # the volume that the rows span, as a share of what rows at right angles would
+    if abs(np.linalg.det(matrix)) <= 1e-9 * np.prod(np.linalg.norm(matrix, axis=1)):
         raise ConfigError(
             f"camera {camera.name!r} needs a projection whose left 3 x 3 part is invertible, got a singular one; "
             "check its calibration"
