@@ -118,8 +118,8 @@ def _colour(rng: np.random.Generator) -> Colour:
 
 
 @lru_cache(maxsize=16)
-def _car_template(shape: str) -> Mesh:
-    return build_car(SHAPES[shape])
+def _car_template(shape: str, fine: bool) -> Mesh:
+    return build_car(SHAPES[shape], fine)
 
 
 @lru_cache(maxsize=8)
@@ -136,7 +136,7 @@ def _large_template(kind: str, variant: int) -> Mesh:
     return vehicles.excavator(6.4, 2.8, 3.2)
 
 
-def _vehicle_mesh(kind: str, size: tuple[float, float, float], rng: np.random.Generator) -> Mesh:
+def _vehicle_mesh(kind: str, size: tuple[float, float, float], fine: bool, rng: np.random.Generator) -> Mesh:
     """A vehicle of the size: the template nearest in proportions, stretched to fit and painted."""
     if kind in ("truck", "bus", "tram", "trailer", "construction_vehicle"):
         template = _large_template(kind, int(rng.integers(2 if kind == "tram" else 3 if kind in ("truck", "trailer") else 1)))
@@ -144,7 +144,7 @@ def _vehicle_mesh(kind: str, size: tuple[float, float, float], rng: np.random.Ge
         names = ("van", "bus_van") if kind == "van" else ("hatchback", "small", "saloon", "estate", "suv", "minivan")
         ratios = np.array([size[2] / size[0] - SHAPES[n].size[2] / SHAPES[n].size[0] for n in names])
         weights = np.exp(-((ratios / 0.035) ** 2)) + 0.04
-        template = _car_template(names[rng.choice(len(names), p=weights / weights.sum())])
+        template = _car_template(names[rng.choice(len(names), p=weights / weights.sum())], fine)
     return template.painted([_colour(rng)]).fitted(*size)
 
 
@@ -195,20 +195,21 @@ def _person_mesh(kind: str, size: tuple[float, float, float], speed: float, rng:
 
 
 def make_actor(id: int, kind: str, motion: Motion, rng: np.random.Generator, dataset: str = "kitti",
-               size: tuple[float, float, float] | None = None, stopped: bool = False) -> Actor:
+               size: tuple[float, float, float] | None = None, stopped: bool = False, fine: bool = True) -> Actor:
     """A road user of a kind, with size, shape and colours drawn at random.
 
-    ``dataset`` (``kitti`` or ``nuscenes``) names the statistics its size is drawn from.
+    ``dataset`` (``kitti`` or ``nuscenes``) names the statistics its size is drawn from; ``fine`` False makes cars coarser, for those
+    that stay far away.
     """
     if size is None:
         size = actor_size(kind, dataset, rng)
     if kind in ("pedestrian", "cyclist"):
         return Actor(id, kind, size, motion, _person_mesh(kind, size, motion.speed, rng), motion.speed != 0, stopped)
-    mesh = _still_mesh(kind, size, rng)
+    mesh = _still_mesh(kind, size, fine, rng)
     return Actor(id, kind, size, motion, lambda _time: mesh, False, stopped)
 
 
-def _still_mesh(kind: str, size: tuple[float, float, float], rng: np.random.Generator) -> Mesh:
+def _still_mesh(kind: str, size: tuple[float, float, float], fine: bool, rng: np.random.Generator) -> Mesh:
     """Mesh of what does not change its shape."""
     if kind == "sitting":
         return people.sitting_person(people.random_style(rng)).fitted(*size)
@@ -224,7 +225,7 @@ def _still_mesh(kind: str, size: tuple[float, float, float], rng: np.random.Gene
         return vehicles.barrier(int(rng.integers(2))).fitted(*size)
     if kind == "cart":
         return vehicles.pushcart(_colour(rng)).fitted(*size)
-    return _vehicle_mesh(kind, size, rng)
+    return _vehicle_mesh(kind, size, fine, rng)
 
 
 def actor_size(kind: str, dataset: str, rng: np.random.Generator) -> tuple[float, float, float]:

@@ -19,7 +19,7 @@ from lcf3d.structures import Camera
 
 Floats = NDArray[np.float32]
 _OPEN_REACH_M = 3.0
-_EDGE_OFFSETS = ((-0.125, -0.375), (0.375, -0.125), (0.125, 0.375), (-0.375, 0.125))
+_EDGE_OFFSETS = ((-0.3, -0.17), (0.3, 0.17))
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +82,7 @@ def measure_exposure(camera: Camera, stage: Stage) -> float:
     hits = stage.tracer.first_hits(origin, direction)
     radiance, _ = _radiance(stage, hits, direction, origin, _forward(camera, stage), np.ones(u.size, np.float32), camera)
     mean = float(np.exp(np.log(np.maximum(radiance.mean(axis=1), 1e-4)).mean()))
-    return float(np.clip(0.16 / mean, 0.35, 6.0 if stage.light.night > 0 else 2.5))
+    return float(np.clip(0.15 / mean, 0.35, 6.0 if stage.light.night > 0 else 2.5))
 
 
 def _forward(camera: Camera, stage: Stage) -> NDArray[np.float64]:
@@ -115,7 +115,7 @@ def render(camera: Camera, stage: Stage, rng: np.random.Generator, exposure: flo
 
 def _smooth(stage: Stage, camera: Camera, u: Floats, v: Floats, edge: NDArray[np.int64], opened: Floats, forward: NDArray[np.float64],
             centre: Floats) -> Floats:
-    """Radiance of the pixels at edges, averaged over four more rays each."""
+    """Radiance of the pixels at edges, averaged over two more rays each."""
     total = centre.copy()
     for du, dv in _EDGE_OFFSETS:
         origin, direction = camera_rays(camera, stage.world_from_lidar, u[edge] + np.float32(du), v[edge] + np.float32(dv))
@@ -211,7 +211,7 @@ def spread_openness(blocked, distance, normal, full, out):  # type: ignore[no-un
                         if same > 0.7:
                             total += blocked[a, b]
                             weight += 1.0
-            half[i, j] = 1.0 - total / weight if weight > 0 else 1.0
+            half[i, j] = 1.0 - total / max(weight, 10.0)  # thin things have too few samples to be sure of
     for i in range(full.shape[0]):
         for j in range(full.shape[1]):
             best, value = 1e9, 1.0
@@ -246,6 +246,8 @@ def find_edges(triangle, material, owner, normal, depth):  # type: ignore[no-unt
 def develop(radiance: Floats, rng: np.random.Generator, exposure: float, night: bool) -> NDArray[np.uint8]:
     """(H, W, 3) uint8 from linear radiance: exposure, film curve, sensor noise, sRGB."""
     x = radiance * np.float32(exposure)
+    grey = x.mean(axis=2, keepdims=True)
+    x = np.maximum(grey + (x - grey) * np.float32(1.12), 0)
     noise = rng.standard_normal(x.shape, dtype=np.float32)
     x = np.maximum(x + noise * (np.float32(0.004) + np.float32(0.012) * np.sqrt(np.maximum(x, 0))) * np.float32(2.0 if night else 1.0), 0)
     return film(x)
@@ -263,5 +265,6 @@ def _film_table() -> NDArray[np.uint8]:
     root = (np.arange(4096) + 0.5) / 4096
     x = root**2 * 8.0
     curve = np.clip(x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14), 0, 1)
+    curve = np.clip(curve * 1.04 - 0.004, 0, 1)
     srgb = np.where(curve < 0.0031308, 12.92 * curve, 1.055 * curve ** (1 / 2.4) - 0.055)
     return np.round(srgb * 255).astype(np.uint8)

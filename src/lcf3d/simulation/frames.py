@@ -139,7 +139,7 @@ def capture(scene: Scene, preset: Preset, time: float, seed: tuple[int, ...], id
         seed: of the sensor noise.
         id: name of the frame.
         images: whether to render the cameras; without them there is no visibility, only boxes and points.
-        threads: cameras rendered at the same time.
+        threads: sensors worked on at the same time.
 
     Raises:
         MissingExtraError: embreex is not installed.
@@ -148,16 +148,20 @@ def capture(scene: Scene, preset: Preset, time: float, seed: tuple[int, ...], id
     lidar_from_world = np.linalg.inv(stage.world_from_lidar)
     boxes = transform_boxes(scene.boxes(time), lidar_from_world)
     sensor = np.random.default_rng([*seed, 1])
-    turn = scan(preset.lidar, stage, scene.ego.velocity(time), preset.rain, sensor)
     renders: dict[str, Render] = {}
     sightings: dict[str, Sightings] = {}
-    if images:
-        renders, sightings = _look(scene, preset, stage, boxes, seed, threads)
-    points_on = points_in_boxes(turn.points, boxes).sum(axis=1).astype(np.int64)
+    with ThreadPoolExecutor(max(1, threads)) as pool:
+        turning = pool.submit(scan, preset.lidar, stage, scene.ego.velocity(time), preset.rain, sensor)
+        if images:
+            renders, sightings = _look(scene, preset, stage, boxes, seed, pool)
+        turn = turning.result()
+    points_on = np.zeros(len(boxes), dtype=np.int64)
+    near = np.flatnonzero(np.hypot(boxes[:, 0], boxes[:, 1]) < preset.lidar.max_range_m + 12.0)
+    points_on[near] = points_in_boxes(turn.points, boxes[near]).sum(axis=1)
     return SimulatedFrame(id, preset, scene, time, stage.world_from_lidar, turn, renders, boxes, points_on, sightings)
 
 
-def _look(scene: Scene, preset: Preset, stage: Stage, boxes: FloatArray, seed: tuple[int, ...], threads: int) -> tuple[dict[str, Render], dict[str, Sightings]]:
+def _look(scene: Scene, preset: Preset, stage: Stage, boxes: FloatArray, seed: tuple[int, ...], pool: ThreadPoolExecutor) -> tuple[dict[str, Render], dict[str, Sightings]]:
     """Images and sightings of all cameras."""
     corners = [stage.mesh.corners[stage.owner == actor.id] for actor in scene.actors]
     shared = measure_exposure(preset.cameras[0], stage)
@@ -170,11 +174,7 @@ def _look(scene: Scene, preset: Preset, stage: Stage, boxes: FloatArray, seed: t
         return picture, sight(camera, picture.owner, scene.actors, corners, boxes, stage.world_from_lidar)
 
     numbers = range(len(preset.cameras))
-    if threads > 1:
-        with ThreadPoolExecutor(threads) as pool:
-            results = list(pool.map(one, numbers))
-    else:
-        results = [one(number) for number in numbers]
+    results = list(pool.map(one, numbers))
     names = [camera.name for camera in preset.cameras]
     return {n: r for n, (r, _) in zip(names, results, strict=True)}, {n: s for n, (_, s) in zip(names, results, strict=True)}
 
@@ -208,7 +208,7 @@ def simulate_frame(preset: str | Preset = "kitti64", seed: int = 0, index: int =
         street: kind of street (``lcf3d.simulation.streets.STREET_NAMES``); None draws one.
         density: factor on the number of road users.
         images: whether to render the cameras.
-        threads: cameras rendered at the same time.
+        threads: sensors worked on at the same time.
 
     Raises:
         ConfigError: unknown preset or street, or a density that the street cannot hold.
@@ -229,7 +229,7 @@ def simulate_drive(preset: str | Preset = "kitti64", seed: int = 0, frames: int 
         street: kind of street; None draws one.
         density: factor on the number of road users.
         images: whether to render the cameras.
-        threads: cameras rendered at the same time.
+        threads: sensors worked on at the same time.
         first: frame to begin with; those before are passed over.
 
     Raises:

@@ -19,13 +19,17 @@ from lcf3d.structures import Camera, FloatArray, IntArray
 
 OCCLUSION_LIMITS: Final = (0.12, 0.50, 0.90)
 """Hidden share of the part inside the image above which an object is partly (1), largely (2) and not recognisably (3) visible."""
-MIN_HEIGHT_PX: Final = 11.0
-"""Objects lower than this in the image become DontCare."""
+MIN_HEIGHT_PX: Final = {"Pedestrian": 26.0, "Person_sitting": 26.0, "Cyclist": 24.0}
+"""Objects of a class that are lower than this in the image (others: `MIN_VEHICLE_HEIGHT_PX`) become DontCare."""
+MIN_VEHICLE_HEIGHT_PX: Final = 13.0
+MIN_IGNORED_HEIGHT_PX: Final = 9.0
+"""Nothing lower than this in the image is mentioned at all, as in KITTI."""
+MIN_IGNORED_PIXELS: Final = 25
 MAX_HIDDEN: Final = 0.97
 """Objects of which less than this share is hidden are labelled; others become DontCare."""
 MAX_DISTANCE_M: Final = 80.0
 """Objects farther away become DontCare."""
-_RAYS = 2500
+_RAYS = 1200
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +41,7 @@ class Sightings:
         amodal: (A, 4) bounds of the projected 3D box clipped to the image, zeros where it is outside.
         pixels: (A,) visible pixels.
         hidden: (A,) share of the part inside the image that something else covers; 1 where nothing is visible.
-        truncated: (A,) share of the object outside the image, or behind the camera.
+        truncated: (A,) share of the object outside the image, or behind the camera; 1 where nothing is visible.
     """
 
     boxes2d: FloatArray
@@ -74,7 +78,7 @@ def sight(camera: Camera, owner: NDArray[np.int32], actors: Sequence[Actor], cor
         mine = whose == k
         v, u = rows[mine], columns[mine]
         visible[k] = u.min(), v.min(), u.max() + 1, v.max() + 1
-    for k in np.flatnonzero(inside):
+    for k in np.flatnonzero(inside & (pixels > 0)):
         hidden[k], truncated[k] = _coverage(camera, owner, actors[k].id, corners[k], boxes[k], world_from_lidar)
     return Sightings(visible, amodal, pixels, hidden, truncated)
 
@@ -162,7 +166,8 @@ def label_order(actors: Sequence[Actor], boxes: FloatArray, sightings: Sightings
     known = np.array([KITTI_CLASS[a.kind] is not None for a in actors], dtype=bool)
     height = sightings.boxes2d[:, 3] - sightings.boxes2d[:, 1]
     distance = np.linalg.norm(boxes[:, :2], axis=1)
-    labelled = known & (sightings.pixels >= 12) & (height >= MIN_HEIGHT_PX) & (sightings.hidden < MAX_HIDDEN)
+    least = np.array([MIN_HEIGHT_PX.get(KITTI_CLASS[a.kind] or "", MIN_VEHICLE_HEIGHT_PX) for a in actors])
+    labelled = known & (sightings.pixels >= 12) & (height >= least) & (sightings.hidden < MAX_HIDDEN)
     labelled &= ((points_on > 0) | (distance < 60)) & (distance < MAX_DISTANCE_M)
-    ignored = known & (sightings.pixels >= 6) & ~labelled
+    ignored = known & (sightings.pixels >= MIN_IGNORED_PIXELS) & (height >= MIN_IGNORED_HEIGHT_PX) & ~labelled
     return np.concatenate([np.flatnonzero(labelled), np.flatnonzero(ignored)]), int(labelled.sum())

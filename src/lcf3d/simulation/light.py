@@ -58,11 +58,11 @@ def make_light(
     cloudiness = max(cloudiness, min(1.0, 1.5 * rain))
     warm = np.clip(1.35 - 1.1 * sun[2], 0, 1)
     clear = 1.0 - 0.93 * np.clip((cloudiness - 0.45) / 0.45, 0, 1)
-    sun_colour = np.array([1.0, 0.93 - 0.13 * warm, 0.82 - 0.25 * warm]) * 2.9 * clear
+    sun_colour = np.array([1.0, 0.93 - 0.13 * warm, 0.82 - 0.25 * warm]) * 3.1 * clear
     blue = np.array([0.30, 0.44, 0.68])
     grey = np.array([0.60, 0.63, 0.68])
     cover = np.clip(cloudiness * 1.2, 0, 1)
-    ambient = blue * 0.62 * (1 - cover) + grey * 0.85 * cover
+    ambient = blue * 0.55 * (1 - cover) + grey * 0.85 * cover
     if night:
         sun_colour, ambient = sun_colour * 0.008, np.array([0.010, 0.013, 0.022])
     lit_ground = 0.13 * (sun_colour * max(sun[2], 0.1) + ambient)
@@ -93,7 +93,7 @@ def _sky(sun: NDArray[np.float64], cloudiness: float, haze: NDArray[np.float64],
         u = (x / (z + 0.12) * scale + shift[k]).astype(np.int64) % SIZE
         v = (y / (z + 0.12) * scale + shift[k + 1]).astype(np.int64) % SIZE
         density += weight * noise[v, u]
-    cover = np.clip((density + 2.6 * (cloudiness - 0.55)) * 1.3, 0, 1) * np.clip(z * 9, 0.15, 1)
+    cover = np.clip((density + 3.6 * (cloudiness - 0.55)) * 1.3, 0, 1) * np.clip(z * 9, 0.15, 1)
     bright = np.clip(1.05 - 0.45 * cover + 0.35 * towards, 0.3, 1.6)
     colour = np.array([0.95, 0.96, 1.0]) * (1.05 - 0.25 * cloudiness)
     result = base * (1 - cover[:, :, None]) + (bright * cover)[:, :, None] * colour

@@ -145,12 +145,12 @@ def facade(x, y, seed, blur, night, albedo):
         if light > 0.85 and fy > high - 0.5 * (high - low):
             curtain = 0.5
     reveal = 0.5 if high - fy < 0.06 else 1.0
-    glass = 0.022 * reveal + 0.30 * curtain * reveal
+    glass = (0.012 + 0.03 * _hash(number + column, 43 + floor)) * reveal + 0.30 * curtain * reveal
     for k in range(3):
         pane = glass * (1 - frame) + 0.55 * frame
         albedo[k] = albedo[k] * (1 - soft) + pane * soft
     if night > 0 and light > 0.62:
         for k in range(3):
             albedo[k] = max(albedo[k], (0.9 - 0.25 * k) * soft * (1 - frame))
-        return -0.35 * soft
+        return -0.14 * soft
     return soft * (1 - frame) * (1 - 0.7 * curtain)

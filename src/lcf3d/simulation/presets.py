@@ -27,7 +27,7 @@ class LidarSpec:
         min_range_m: nothing is measured nearer.
         noise_m: standard deviation of the range.
         height_m: above the ground.
-        sensitivity: intensity * (1 / range)^2 * sensitivity is the chance scale of a return; larger sees darker things.
+        sensitivity: a beam returns with chance ``1 - exp(-4 sensitivity * reflected share / range^2)``.
         base_loss: share of beams lost for no visible reason.
     """
 
@@ -80,14 +80,14 @@ class Preset:
 
 HDL64: Final = LidarSpec(
     tuple(np.round(np.concatenate([np.linspace(-23.7, -8.4, 32), np.linspace(-7.9, 2.5, 32)]), 3).tolist()),
-    2083, 10.0, 80.0, 1.5, 0.02, 1.73, 900.0, 0.015,
+    2083, 10.0, 80.0, 1.5, 0.02, 1.73, 4500.0, 0.015,
 )
 """A 64-beam scanner; beam elevations measured as the medians over 32 scans of KITTI (0.335 and 0.494 degrees apart)."""
 HDL32: Final = LidarSpec(
-    tuple(np.round(np.linspace(-30.67, 10.67, 32), 3).tolist()), 1084, 20.0, 100.0, 1.0, 0.02, 1.84, 900.0, 0.02
+    tuple(np.round(np.linspace(-30.67, 10.67, 32), 3).tolist()), 1084, 20.0, 100.0, 1.0, 0.02, 1.84, 4500.0, 0.02
 )
 """A 32-beam scanner with the published elevations of nuScenes' sensor."""
-VLP16: Final = LidarSpec(tuple(np.linspace(-15.0, 15.0, 16).tolist()), 1800, 10.0, 100.0, 0.5, 0.03, 1.73, 900.0, 0.02)
+VLP16: Final = LidarSpec(tuple(np.linspace(-15.0, 15.0, 16).tolist()), 1800, 10.0, 100.0, 0.5, 0.03, 1.73, 4500.0, 0.02)
 """A 16-beam scanner, two degrees between beams."""
 
 KITTI_FOCAL: Final = 721.5377

@@ -105,7 +105,7 @@ def build_scene(
     lane = drive * (0.5 if kind.lanes == 1 else 0.74)
     path = Path((first, lane), heading, first - 5, last + 5, bend)
     crossings, sides = _crossings(path, kind.crossings, kind.half_width, last, rng)
-    site = Site(kind, path, terrain, first, last, crossings, sides)
+    site = Site(kind, path, terrain, first, last, speed * duration, crossings, sides)
     ego = Motion(path, 0.0, -lane, speed)
     static = build_scenery(site, rng)
     actors = populate(site, ego, dataset, duration, density, rng)

@@ -37,6 +37,7 @@ class Site:
         terrain: height of the land.
         first: arc length at which the built stretch begins.
         last: arc length at which it ends.
+        travel: metres that the sensors travel from arc length 0.
         crossings: (arc length, half width of the side street) of every side street.
         side_paths: centre lines of the side streets, one a crossing and side.
     """
@@ -46,6 +47,7 @@ class Site:
     terrain: Terrain
     first: float
     last: float
+    travel: float
     crossings: tuple[tuple[float, float], ...]
     side_paths: tuple[Path, ...]
 
@@ -70,6 +72,10 @@ class Site:
     def gaps(self) -> list[tuple[float, float]]:
         """Stretches of the pavement that side streets take."""
         return [(s - w - 0.5, s + w + 0.5) for s, w in self.crossings]
+
+    def is_near(self, s: float) -> bool:
+        """Whether the sensors come so close to arc length ``s`` that single leaves can be told apart."""
+        return -12.0 < s < 32.0 + self.travel
 
     def near_crossing(self, s: float, margin: float) -> bool:
         """Whether arc length ``s`` lies in a side street or within ``margin`` metres of it."""
@@ -113,7 +119,7 @@ def build_scenery(site: Site, rng: np.random.Generator) -> Mesh:
     return Mesh.join(parts)
 
 
-_VARIANTS: Final = {"tree": 14, "conifer": 4, "bush": 8, "hedge": 4, "undergrowth": 8, "fence": 2, "bollard": 1, "lamp": 2, "bin": 1,
+_VARIANTS: Final = {"tree": 8, "fine_tree": 8, "conifer": 4, "bush": 8, "hedge": 4, "undergrowth": 8, "fine_undergrowth": 8, "fence": 2, "bollard": 1, "lamp": 2, "bin": 1,
                     "bench": 1, "shelter": 1, "delineator": 1, "rail": 1, "light": 1, "sign": 4}
 
 
@@ -122,15 +128,19 @@ def _template(kind: str, variant: int) -> Mesh:
     """One of ``_VARIANTS`` ready-made things, made when first used; plants and fences are stretched where they are put."""
     rng = np.random.default_rng(7000 + variant)
     if kind == "tree":
-        return build.tree(8.5, 8.5 * float(rng.uniform(0.5, 0.7)), GREENS[variant % 5], 130, rng)
+        return build.tree(8.5, 8.5 * float(rng.uniform(0.5, 0.7)), GREENS[variant % 5], 120, 0.32, rng)
+    if kind == "fine_tree":
+        return build.tree(8.5, 8.5 * float(rng.uniform(0.5, 0.7)), GREENS[variant % 5], 700, 0.115, rng)
     if kind == "conifer":
-        return build.conifer(9.5, 3.8, (0.035, 0.065, 0.03), 110, rng)
+        return build.conifer(9.5, 3.8, (0.035, 0.065, 0.03), 300, rng)
     if kind == "bush":
-        return build.bush(1.3, 1.2, 1.2, GREENS[variant % 5], 280, rng)
+        return build.bush(1.3, 1.2, 1.2, GREENS[variant % 5], 620, rng)
     if kind == "hedge":
         return build.hedge(5.0, 1.3, GREENS[variant], rng)
     if kind == "undergrowth":
-        return build.undergrowth(4.4, 5.0, float(rng.uniform(0.9, 2.6)), 520, GREENS[variant % 5], rng)
+        return build.undergrowth(4.4, 5.0, float(rng.uniform(0.9, 2.6)), 450, 0.28, GREENS[variant % 5], rng)
+    if kind == "fine_undergrowth":
+        return build.undergrowth(4.4, 5.0, float(rng.uniform(0.9, 2.6)), 1900, 0.13, GREENS[variant % 5], rng)
     if kind == "fence":
         return build.fence(5.0, 1.1, variant == 1)
     if kind == "lamp":
@@ -159,7 +169,7 @@ def _place(site: Site, mesh: Mesh, s: float, offset: float, side: float, lift: f
 def _ground(site: Site, rng: np.random.Generator) -> list[Mesh]:
     x, y, _ = site.path.at((site.first + site.last) / 2)
     centre = (float(x), float(y))
-    green = np.array([0.085, 0.12, 0.035]) * rng.uniform(0.85, 1.2)
+    green = np.array([0.080, 0.100, 0.038]) * rng.uniform(0.85, 1.2)
     return [open_ground(site.terrain, centre, 460.0, "grass", (green[0], green[1], green[2]), 0.06), skyline(centre, rng)]
 
 
@@ -184,7 +194,7 @@ def _surfaces(site: Site) -> list[Mesh]:
                 parts.append(along((w + 0.15, outer), (KERB, KERB), "cobbles" if street.paving == "cobbles" else "pavement", slab))
             far = site.building_line if street.buildings != "woods" else w + street.verge
             if far > outer + 0.05 or street.verge:
-                garden = (0.075, 0.11, 0.03)
+                garden = (0.072, 0.092, 0.034)
                 last = max(far + (14.0 if street.buildings in ("houses", "few") else 0.0), outer + 0.3)
                 parts.append(along((outer, outer + 0.05, last), (lowest, lowest, lowest * 0.7), "grass", garden))
             if street.buildings == "blocks":
@@ -284,18 +294,18 @@ def _front_garden(site: Site, side: float, first: float, last: float, rng: np.ra
             piece = None
         if piece is not None:
             parts.append(_place(site, piece, (a + b) / 2, edge, side, KERB * 0.8))
-        for _ in range(int(rng.integers(0, 3))):
+        for _ in range(int(rng.integers(1, 4))):
             size = rng.uniform(0.7, 1.8)
             bush = _any("bush", rng).scaled(np.array([1.0, 1.0, rng.uniform(0.7, 1.2)]) * size / 1.2)
             parts.append(_place(site, bush, float(rng.uniform(a, b)), edge + float(rng.uniform(0.9, 2.6)), side, KERB * 0.7))
-    if rng.random() < 0.5:
+    if rng.random() < 0.75:
         parts.append(_tree(site, float(rng.uniform(first, last)), edge + float(rng.uniform(1.5, 2.5)), side, rng, 0.7))
     return parts
 
 
 def _tree(site: Site, s: float, offset: float, side: float, rng: np.random.Generator, scale: float = 1.0) -> Mesh:
     size = float(rng.uniform(0.7, 1.3)) * scale
-    mesh = _any("conifer" if rng.random() < 0.15 else "tree", rng).scaled(np.array([1, 1, rng.uniform(0.85, 1.15)]) * size)
+    mesh = _any("conifer" if rng.random() < 0.15 else "fine_tree" if site.is_near(s) else "tree", rng).scaled(np.array([1, 1, rng.uniform(0.85, 1.15)]) * size)
     mesh = mesh.placed(0, 0, 0, float(rng.uniform(0, 6.28)))
     return _place(site, mesh, s, offset, side, KERB * 0.7)
 
@@ -382,7 +392,7 @@ def _woods(site: Site, side: float, rng: np.random.Generator) -> list[Mesh]:
         if site.near_crossing(s, 5.0):
             continue
         if dense:
-            plants = _any("undergrowth", rng)
+            plants = _any("fine_undergrowth" if site.is_near(s) else "undergrowth", rng)
             parts.append(_place(site, plants, float(s), wall + 0.5 + float(rng.uniform(0, 1)), side))
         if rng.random() < (0.75 if dense else 0.06):
             offset = wall + float(rng.uniform(2.0, 7.0)) + (0 if dense else float(rng.uniform(2, 20)))

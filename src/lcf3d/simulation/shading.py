@@ -36,15 +36,15 @@ def _mirror(sky, light, x, y, z, out):
     """What is seen in a mirror that looks that way: sky, a dim row of houses at the horizon, or the road."""
     azimuth = math.atan2(y, x)
     skyline = 0.10 + 0.12 * value_noise(azimuth * 4.0, 3.7) + 0.08 * value_noise(azimuth * 13.0, 9.1)
-    if z > skyline:
+    bright = 0.16 + 0.22 * value_noise(azimuth * 9.0, 1.3)
+    above = min(max((z - skyline) / 0.06 + 0.5, 0.0), 1.0)
+    below = min(max(0.5 - z / 0.16, 0.0), 1.0)
+    if above > 0:
         _sky(sky, x, y, z, out)
-    elif z > 0.0:
-        bright = 0.20 + 0.25 * value_noise(azimuth * 9.0, 1.3)
-        for k in range(3):
-            out[k] = bright * (light[6 + k] + 0.35 * light[3 + k])
-    else:
-        for k in range(3):
-            out[k] = 0.9 * light[9 + k]
+    for k in range(3):
+        houses = bright * (light[6 + k] + 0.35 * light[3 + k])
+        low = houses * (1 - below) + 0.8 * light[9 + k] * below
+        out[k] = out[k] * above + low * (1 - above) if above > 0 else low
 
 
 @njit(cache=True, nogil=True)
@@ -128,7 +128,7 @@ def shade(triangle, u, v, distance, direction, position, normal, lit, open_sky, 
                 for k in range(3):
                     albedo[k] *= 1 - 0.45 * light[16]
                 specular += light[16] * (0.02 + 0.10 * max(puddle - 0.45, 0.0))
-                gloss = 0.9
+                gloss = 0.6
         elif kind == 4:
             sample(textures, texture, s * 2.7 / tile, r * 3.0 / tile, large / tile * SIZE, albedo)
             window = facade(s, r, seed[t], large / 2.8, light[17], albedo)
@@ -194,7 +194,7 @@ def _light_surface(kind, albedo, specular, gloss, nx, ny, nz, dx, dy, dz, px, py
     """Radiance that leaves a surface towards the eye, into ``out``."""
     cosine = nx * light[0] + ny * light[1] + nz * light[2]
     if kind == 6:
-        direct = lit * (0.30 + 0.70 * max(cosine, 0.0) + 0.25 * max(-cosine, 0.0))
+        direct = lit * (0.38 + 0.62 * max(cosine, 0.0) + 0.30 * max(-cosine, 0.0))
     else:
         direct = lit * max(cosine, 0.0)
     up = 0.5 + 0.5 * nz

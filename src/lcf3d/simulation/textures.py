@@ -72,7 +72,7 @@ def _cobbles(rng: np.random.Generator) -> Tile:
 def _grass(rng: np.random.Generator) -> Tile:
     blades = _noise(rng, 0.55, 6, (0.7, 1.2))
     patches = _noise(rng, 1.6, 1)
-    light = 1 + 0.22 * blades + 0.16 * patches
+    light = np.clip(1 + 0.34 * blades + 0.18 * patches, 0.15, 2.2)
     dry = np.clip(0.5 + 0.5 * patches, 0, 1)
     return np.stack([light * (0.92 + 0.30 * dry), light, light * (0.95 + 0.05 * dry)], axis=-1)
 

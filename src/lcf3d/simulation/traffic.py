@@ -66,7 +66,8 @@ class Crowd:
             m = motion()
             track = self._track(m, size)
             if self._is_clear(track, margin):
-                self.actors.append(make_actor(len(self.actors) + 1, kind, m, self.rng, self.dataset, size, stopped))
+                fine = bool(np.linalg.norm(track[:, 0, :2] - self._discs[0][:, 0, :2], axis=1).min() < 40.0)
+                self.actors.append(make_actor(len(self.actors) + 1, kind, m, self.rng, self.dataset, size, stopped, fine))
                 self._discs.append(track)
                 return True
         self.refused += 1

@@ -95,17 +95,18 @@ SHAPES: Final[dict[str, CarShape]] = {
 }
 
 
-def _stations(shape: CarShape) -> NDArray[np.float64]:
+def _stations(shape: CarShape, fine: bool) -> NDArray[np.float64]:
     """Positions along the body at which it gets a cross-section, front to rear."""
     arch = shape.wheel_radius * 1.13 / shape.size[0]
-    around = np.array([-1.0, -0.97, -0.85, -0.6, -0.3, 0, 0.3, 0.6, 0.85, 0.97, 1.0]) * arch
+    round_arch = [-1.0, -0.97, -0.85, -0.6, -0.3, 0, 0.3, 0.6, 0.85, 0.97, 1.0]
+    around = np.array(round_arch if fine else [-1.0, -0.85, 0, 0.85, 1.0]) * arch
     pillars = [(shape.side_glass[0] + shape.side_glass[1]) / 2 + d for d in (-0.012, 0.012)]
     edges = [e + d for e in (*shape.screen, *shape.rear) for d in (0.0, 0.008)]
     positions = [0.0, 0.03, 0.075, 0.105, 0.93, 0.97, 0.992, 1.0, *pillars, *edges, *shape.side_glass]
     positions += [a + d for a in shape.axles for d in around]
     positions += [p for p, _ in shape.profile]
     values = np.unique(np.round(np.clip(positions, 0, 1), 4))
-    return values[np.concatenate([[True], np.diff(values) > 0.0025])]
+    return values[np.concatenate([[True], np.diff(values) > (0.0025 if fine else 0.0065)])]
 
 
 def _sections(shape: CarShape, s: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -145,10 +146,13 @@ def _sections(shape: CarShape, s: NDArray[np.float64]) -> tuple[NDArray[np.float
     return np.stack([np.stack(row, axis=1) for row in rows], axis=1), glass / height
 
 
-def build_car(shape: CarShape) -> Mesh:
-    """The template of a shape in metres, x forward, wheels standing on z = 0; bodywork has colour ``PAINT_MARK``."""
+def build_car(shape: CarShape, fine: bool = True) -> Mesh:
+    """The template of a shape in metres, x forward, wheels standing on z = 0; bodywork has colour ``PAINT_MARK``.
+
+    ``fine`` False leaves out what cannot be seen from more than 40 m away.
+    """
     length, width, height = shape.size
-    s = _stations(shape)
+    s = _stations(shape, fine)
     half, glass = _sections(shape, s)
     x = (0.5 - s) * length
     full = np.concatenate([half, half[:, -2::-1] * [-1, 1]], axis=1)
@@ -158,11 +162,11 @@ def build_car(shape: CarShape) -> Mesh:
     caps = [
         grid(np.stack([points[i] * [1, 0, 1], points[i]]), "paint", PAINT_MARK) for i in (0, -1)
     ]
-    parts = [body, *caps, *_details(shape), _interior(shape)]
+    parts = [body, *caps, *_details(shape, fine), _interior(shape)]
     for axle in shape.axles:
         for side in (1.0, -1.0):
             y = side * (width / 2 - 0.115)
-            parts.append(wheel((0.5 - axle) * length, y, shape.wheel_radius, 0.2, side, (0.45, 0.46, 0.48)))
+            parts.append(wheel((0.5 - axle) * length, y, shape.wheel_radius, 0.2, side, (0.45, 0.46, 0.48), 18 if fine else 9))
     return Mesh.join(parts)
 
 
@@ -195,7 +199,7 @@ def _colour_body(body: Mesh, shape: CarShape, s: NDArray[np.float64], glass: NDA
     )
 
 
-def _details(shape: CarShape) -> list[Mesh]:
+def _details(shape: CarShape, fine: bool) -> list[Mesh]:
     """Lamps, grille, plates, bumpers, mirrors and door lines."""
     length, width, height = shape.size
     half_l, half_w = length / 2, width / 2
@@ -208,10 +212,10 @@ def _details(shape: CarShape) -> list[Mesh]:
         high = 0.055 * height
         parts.append(panel((half_l + e - 0.012, inner, lamp_z - high), (half_l - 0.035, outer, lamp_z - high * 0.8),
                            (half_l - 0.075, outer, lamp_z + high * 1.25), (half_l - 0.022, inner, lamp_z + high * 0.8),
-                           "headlamp", (0.75, 0.78, 0.8)))
+                           "headlamp", (0.30, 0.32, 0.34)))
         parts.append(panel((half_l - 0.035, outer, lamp_z - high * 0.8), (half_l - 0.24, 0.963 * half_w * side, lamp_z),
                            (half_l - 0.30, 0.965 * half_w * side, lamp_z + high * 1.4),
-                           (half_l - 0.075, outer, lamp_z + high * 1.25), "headlamp", (0.75, 0.78, 0.8)))
+                           (half_l - 0.075, outer, lamp_z + high * 1.25), "headlamp", (0.30, 0.32, 0.34)))
         rear_z, rear_h = (0.42 if tall else 0.53) * height, (0.12 if tall else 0.075) * height
         rin = (0.74 if tall else 0.52) * half_w * side
         parts.append(panel((-half_l - 0.004, rin, rear_z - rear_h), (-half_l + 0.025, 0.86 * half_w * side, rear_z - rear_h),
@@ -241,7 +245,7 @@ def _details(shape: CarShape) -> list[Mesh]:
     parts.append(panel((-half_l - 0.01, -0.78 * half_w, 0.15 * height), (-half_l - 0.01, 0.78 * half_w, 0.15 * height),
                        (-half_l - 0.01, 0.76 * half_w, 0.24 * height), (-half_l - 0.01, -0.76 * half_w, 0.24 * height),
                        "plastic", _BLACK))
-    return parts + _door_lines(shape)
+    return parts + (_door_lines(shape) if fine else [])
 
 
 def _door_lines(shape: CarShape) -> list[Mesh]:
