@@ -19,6 +19,9 @@ VERBS: dict[str, str] = {
     "config": "config",
     "check": "check",
     "bench": "bench",
+    "models": "models",
+    "calibrate": "calibrate",
+    "ablate": "ablate",
 }
 
 app = typer.Typer(
@@ -39,4 +42,8 @@ def main() -> None:
         app()
     except Lcf3dError as error:
         typer.echo(f"error: {error}", err=True)
+        sys.exit(2)
+    except OSError as error:
+        # no space left, no permission, a folder in the way: the system's own words name the file
+        typer.echo(f"error: {error.strerror or error}: {error.filename or ''}".rstrip(": "), err=True)
         sys.exit(2)

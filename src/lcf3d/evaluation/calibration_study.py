@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -25,7 +25,7 @@ from lcf3d.structures import BoolArray, Detections2D, Detections3D, FloatArray, 
 # a class with fewer judged detections than this, or fewer right or wrong ones than a quarter of it, gets no map
 FEWEST = 20
 
-Progress = Callable[[Sequence[int]], Sequence[int]]
+Progress = Callable[[Sequence[int]], Iterable[int]]
 
 
 class Judged(NamedTuple):

@@ -64,8 +64,8 @@ class FusionConfig(BaseModel):
         default=0.1, description="BEV IoU with a confirmed box that makes a recovered one a double"
     )
 
-    ensemble: Literal["probabilistic", "product", "evidence"] = Field(
-        default="probabilistic", description="how agreeing scores are fused"
+    ensemble: Literal["probabilistic", "product", "evidence", "none"] = Field(
+        default="probabilistic", description="how scores are fused; none keeps the LiDAR branch's score and class"
     )
     evidence: dict[str, Evidence] = Field(
         default_factory=dict, description="ensemble evidence: weights by class, where no calibration gives them"
@@ -173,7 +173,7 @@ PRESETS: dict[str, dict[str, Any]] = {
     "kitti": {
         "camera_score_threshold": 0.1,
         "decisive_score": 0.5,
-        "lidar_score_threshold": 0.01,
+        "lidar_score_threshold": 0.0,
         "class_aware": True,
         "assignment": "class_first",
         "unmatched": "downweight",

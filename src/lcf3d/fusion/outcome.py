@@ -75,10 +75,11 @@ def decide_clusters(
     reason = np.full(len(box), Reason.UNCONFIRMED, dtype=np.int64)
 
     agreed = labels[matched] == camera_labels
-    ensemble: Ensemble = "product" if config.ensemble == "product" else "probabilistic"
-    scores[matched], labels[matched] = semantic_fusion(
-        scores[matched], labels[matched], camera_scores, camera_labels, config.prior_array(), ensemble
-    )
+    if config.ensemble != "none":
+        ensemble: Ensemble = "product" if config.ensemble == "product" else "probabilistic"
+        scores[matched], labels[matched] = semantic_fusion(
+            scores[matched], labels[matched], camera_scores, camera_labels, config.prior_array(), ensemble
+        )
     if weighed is not None:
         scores[matched[agreed]] = weighed[matched[agreed]]
     stage[matched], reason[matched] = Stage.MATCHED, Reason.CONFIRMED

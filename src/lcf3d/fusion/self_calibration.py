@@ -107,8 +107,8 @@ def _taught_map(scores: FloatArray, confirmed: BoolArray, taught: BoolArray) -> 
     transform: Transform = natural_transform(scores)
     x = transform_scores(scores, transform)
     low, middle, high = np.quantile(x, (0.25, 0.5, 0.75))
-    # the median at even odds, the quartiles one unit of log-odds away
-    prior = 1 / max(float(high - low) / 2, 0.25)
+    # the median at even odds, the quartiles one unit of log-odds away; never steeper than a logit, for lone boxes
+    prior = 1 / max(float(high - low) / 2, 1.0)
     slope, intercept = fit_platt(
         x[taught], confirmed[taught].astype(np.float64), prior=(prior, -prior * float(middle)), strength=PRIOR_STRENGTH
     )

@@ -156,7 +156,7 @@ class StereoLateCascadeFusion(LateCascadeFusion):
             table = branches.camera_table
             table.pair[rows], table.pair[other_rows] = other_rows, rows
             branches.lidar_table.pair[branches.lidar_index[outcome.box[both]]] = other_rows
-            if self.config.ensemble == "evidence":
+            if self.config.ensemble == "evidence" or self.config.ensemble == "none":
                 continue
             found = branches.camera[second]
             agreed = found.labels[other] == outcome.labels[both]

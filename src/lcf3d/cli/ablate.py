@@ -1,0 +1,102 @@
+"""``lcf3d ablate``: what each part of the fusion brings, one table."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from lcf3d.errors import ConfigError
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from lcf3d.evaluation.ablation import AblationInput, AblationRow
+    from lcf3d.formats.kitti import KittiFrames
+    from lcf3d.fusion.calibration import Calibration
+    from lcf3d.fusion.config import FusionConfig
+
+
+def ablate(
+    dataset: Annotated[str, typer.Argument(help="kitti:ROOT, with labels")],
+    lidar: Annotated[str, typer.Option(help="results of the LiDAR detector, results:DIR")],
+    camera: Annotated[str, typer.Option(help="results of the camera detector, results:DIR")],
+    split: Annotated[str, typer.Option(help="file of ROOT/ImageSets")] = "val",
+    calibration: Annotated[
+        str, typer.Option(help="score calibration: a file of 'lcf3d calibrate', auto, or none")
+    ] = "auto",
+    config: Annotated[str, typer.Option(help="preset or YAML file that the variants change")] = "kitti",
+    set_: Annotated[list[str] | None, typer.Option("--set", help="change a setting, name=value; repeatable")] = None,
+    missing: Annotated[str, typer.Option(help="result files that are not there: error, or empty")] = "error",
+    json_: Annotated[bool, typer.Option("--json", help="print the rows as JSON")] = False,
+) -> None:
+    """Measure the fusion with parts of it switched off or exchanged (3D AP R40).
+
+    Rows with detection recovery need LiDAR scans for all frames, mask modes a camera detector with masks.
+
+    Example: lcf3d ablate kitti:KITTI --split val --lidar results:point_gnn --camera results:rcnn
+    """
+    import json
+
+    from lcf3d.cli.calibrate import plain, tracked, wide_console
+    from lcf3d.cli.options import build_config
+    from lcf3d.evaluation.ablation import ablate as measure
+
+    settings = build_config(config, set_ or [])
+    inputs, truth = _read(dataset, split, lidar, camera, settings, missing)
+    scores = _calibration(calibration, inputs, settings)
+    rows = measure(inputs, truth, settings, scores, progress=plain if json_ else tracked)
+    scans = all(item.frame.points is not None for item in inputs)
+    if json_:
+        typer.echo(json.dumps({"frames": len(inputs), "scans": scans, "rows": [r.to_json() for r in rows]}, indent=2))
+        return
+    console = wide_console()
+    console.print(_table(rows, len(inputs)))
+    if not scans:
+        console.print("not every frame has a LiDAR scan: rows with detection recovery are left out", soft_wrap=True)
+
+
+def _read(
+    dataset: str, split: str, lidar: str, camera: str, settings: FusionConfig, missing: str
+) -> tuple[list[AblationInput], KittiFrames]:
+    """Frames with their detections, and the labels."""
+    from lcf3d.cli.calibrate import open_study
+    from lcf3d.evaluation.ablation import AblationInput
+
+    study = open_study(dataset, split, lidar, camera, settings, folds=0, missing=missing, quiet=True)
+    inputs = zip(study.frames, study.lidar_inputs, study.camera_inputs, strict=True)
+    return [AblationInput(*item) for item in inputs], study.truth
+
+
+def _calibration(text: str, inputs: Sequence[AblationInput], settings: FusionConfig) -> Calibration | None:
+    from lcf3d.fusion.calibration import load_calibration
+    from lcf3d.fusion.self_calibration import self_calibrate
+
+    if text == "auto":
+        return self_calibrate(inputs, settings)
+    if not text:
+        raise ConfigError("--calibration takes a file, auto or none")
+    return load_calibration(text)
+
+
+def _table(rows: Sequence[AblationRow], frames: int) -> Table:
+    """The rows under their headings; classes without any figure are left out."""
+    from rich.table import Table
+
+    names = [name for name in rows[0].ap if any(ap[0] == ap[0] for ap in (row.ap[name] for row in rows))]
+    table = Table(title=f"3D AP R40, easy moderate hard, on {frames} frames")
+    table.add_column("variant", no_wrap=True)
+    for name in names:
+        table.add_column(name, justify="right", no_wrap=True)
+    for stage in ("matched", "recovered", "kept"):
+        table.add_column(stage, justify="right")
+    group = ""
+    for row in rows:
+        if row.group != group:
+            group = row.group
+            table.add_section()
+            table.add_row(f"[bold]{group}[/bold]")
+        cells = (" ".join(f"{value:.2f}" for value in row.ap[name]) for name in names)
+        table.add_row(row.name, *cells, str(row.matched), str(row.recovered), str(row.kept))
+    return table

@@ -1,0 +1,165 @@
+"""What each part of the fusion brings: the paper's table of module contributions, and the variants of each part."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from lcf3d.evaluation.calibration_study import average_precisions, result_objects
+from lcf3d.evaluation.kitti import evaluate
+from lcf3d.formats.kitti import KittiFrames
+from lcf3d.fusion.calibration import Calibration
+from lcf3d.fusion.config import FusionConfig
+from lcf3d.fusion.pipeline import LateCascadeFusion
+from lcf3d.localizers.base import Localizer
+from lcf3d.provenance import Stage
+from lcf3d.structures import Detections2D, Detections3D, Frame
+
+Progress = Callable[[Sequence[int]], Iterable[int]]
+
+
+class AblationInput(NamedTuple):
+    """One frame with the detections of both branches; the 2D ones are of its first camera."""
+
+    frame: Frame
+    lidar: Detections3D
+    camera: Detections2D
+
+
+class Variant(NamedTuple):
+    """One row to measure.
+
+    Attributes:
+        group: heading.
+        name: what is varied, in words.
+        changes: settings that differ from those at hand; None for the LiDAR branch without any fusion.
+    """
+
+    group: str
+    name: str
+    changes: dict[str, Any] | None
+
+
+@dataclass(frozen=True)
+class AblationRow:
+    """The result of one variant.
+
+    Attributes:
+        group: heading.
+        name: what was varied.
+        ap: 3D AP R40 easy, moderate, hard by class, in percent; NaN where there are no detections of a class.
+        matched: output boxes that a camera detection confirms.
+        recovered: output boxes found from camera detections alone.
+        kept: output boxes of the LiDAR branch that nothing confirms.
+    """
+
+    group: str
+    name: str
+    ap: dict[str, tuple[float, float, float]]
+    matched: int = 0
+    recovered: int = 0
+    kept: int = 0
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain JSON values, None for NaN."""
+        values = asdict(self)
+        values["ap"] = {name: [None if np.isnan(v) else v for v in ap] for name, ap in self.ap.items()}
+        return values
+
+
+# the filter of the paper, whose modules its table switches on one after the other
+_FILTER: dict[str, Any] = {"unmatched": "drop", "ensemble": "none", "recovery": False}
+MODULES = "modules of the paper's filter"
+
+
+def variants(config: FusionConfig, scans: bool, masks: bool) -> list[Variant]:
+    """The rows that make sense: those with recovery only where there are scans, mask modes only where there are masks.
+
+    Args:
+        config: settings that the variants change.
+        scans: whether the frames have LiDAR scans.
+        masks: whether camera detections have instance masks.
+    """
+    semantic = {"ensemble": "probabilistic"}
+    rows = [
+        Variant(MODULES, "none: LiDAR alone", None),
+        Variant(MODULES, "recovery only", {**_FILTER, "unmatched": "keep", "recovery": True}),
+        Variant(MODULES, "matching", _FILTER),
+        Variant(MODULES, "matching + recovery", {**_FILTER, "recovery": True}),
+        Variant(MODULES, "matching + semantic", {**_FILTER, **semantic}),
+        Variant(MODULES, "matching + recovery + semantic", {**_FILTER, **semantic, "recovery": True}),
+    ]
+    here: dict[str, Any] = {"recovery": config.recovery}
+    rows.append(Variant("these settings", "as they are", here))
+    for method, iou in (("nms", 0.3), ("components", 0.5), ("cliques", 0.3)):
+        changes = {**here, "clustering": method, "cluster_iou": iou}
+        rows.append(Variant("clustering", f"{method}, BEV IoU {iou}", changes))
+    for policy in ("drop", "downweight", "keep"):
+        rows.append(Variant("unmatched clusters", policy, {**here, "unmatched": policy}))
+    for ensemble in ("none", "product", "probabilistic", "evidence"):
+        rows.append(Variant("ensemble", ensemble, {**here, "ensemble": ensemble}))
+    if masks and scans:
+        for mode in ("box", "mask", "box+mask"):
+            rows.append(Variant("instance masks", mode, {"recovery": True, "mask_mode": mode}))
+    if scans:
+        return rows
+    without = [row for row in rows if not (row.group == MODULES and (row.changes or {}).get("recovery"))]
+    return [
+        row._replace(changes=None if row.changes is None else {**row.changes, "recovery": False}) for row in without
+    ]
+
+
+def ablate(
+    inputs: Sequence[AblationInput],
+    truth: KittiFrames,
+    config: FusionConfig,
+    calibration: Calibration | None = None,
+    localizer: Localizer | None = None,
+    progress: Progress = lambda indices: indices,
+) -> list[AblationRow]:
+    """Measure all variants on frames of a KITTI-layout dataset.
+
+    Args:
+        inputs: frames and detections.
+        truth: labels of the same frames.
+        config: settings that the variants change.
+        calibration: score calibration, see `LateCascadeFusion`.
+        localizer: for recovery, see `LateCascadeFusion`.
+        progress: wraps the loop over variants, for a progress bar.
+    """
+    scans = all(item.frame.points is not None for item in inputs)
+    masks = any(item.camera.masks is not None for item in inputs)
+    chosen = variants(config, scans, masks)
+    return [_measure(inputs, truth, chosen[i], config, calibration, localizer) for i in progress(range(len(chosen)))]
+
+
+def _measure(
+    inputs: Sequence[AblationInput],
+    truth: KittiFrames,
+    variant: Variant,
+    config: FusionConfig,
+    calibration: Calibration | None,
+    localizer: Localizer | None,
+) -> AblationRow:
+    stages = np.zeros(len(Stage), dtype=np.int64)
+    results = []
+    fusion = None
+    if variant.changes is not None:
+        fusion = LateCascadeFusion(config.updated(**variant.changes), localizer, calibration)
+    for item in inputs:
+        detections = item.lidar
+        if fusion is not None:
+            fused = fusion(item.frame, item.lidar, {item.frame.cameras[0].name: item.camera})
+            detections = fused.detections
+            stages += np.bincount(fused.stages, minlength=len(Stage))
+        results.append(result_objects(item.frame, detections))
+    metrics = evaluate(truth, KittiFrames.from_frames(truth.frame_ids, results))
+    return AblationRow(
+        variant.group,
+        variant.name,
+        {name: average_precisions(metrics, name) for name in config.class_names},
+        *(int(stages[s]) for s in (Stage.MATCHED, Stage.RECOVERED, Stage.KEPT)),
+    )
