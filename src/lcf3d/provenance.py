@@ -241,7 +241,7 @@ class FusedDetections:
 
     @classmethod
     def from_json(cls, value: dict[str, Any]) -> FusedDetections:
-        """The inverse of `to_json`; instance masks, velocities and attributes of the inputs are not kept."""
+        """The inverse of `to_json`; instance masks are not kept."""
         return cls(
             detections=Detections3D(**_detections_from_json(value["detections"])),
             lidar=Decisions.from_rows(value["lidar"]),
@@ -255,13 +255,23 @@ class FusedDetections:
 
 def _detections_to_json(detections: Detections2D | Detections3D) -> dict[str, Any]:
     # five decimals are a hundredth of a millimetre, and a third of the size
-    return {
+    value: dict[str, Any] = {
         "boxes": np.round(detections.boxes, 5).tolist(),
         "scores": np.round(detections.scores, 7).tolist(),
         "labels": detections.labels.tolist(),
         "class_names": list(detections.class_names),
     }
+    if isinstance(detections, Detections3D) and detections.velocities is not None:
+        unknown = np.isnan(detections.velocities).any(axis=1)
+        velocities = np.round(detections.velocities, 5).tolist()
+        value["velocities"] = [None if u else v for u, v in zip(unknown, velocities, strict=True)]
+    if isinstance(detections, Detections3D) and detections.attributes is not None:
+        value["attributes"] = detections.attributes.tolist()
+    return value
 
 
 def _detections_from_json(value: dict[str, Any]) -> dict[str, Any]:
-    return {**value, "class_names": tuple(value["class_names"])}
+    value = {**value, "class_names": tuple(value["class_names"])}
+    if "velocities" in value:
+        value["velocities"] = [[np.nan, np.nan] if v is None else v for v in value["velocities"]]
+    return value

@@ -8,19 +8,23 @@ import yaml
 
 from lcf3d.errors import ConfigError
 from lcf3d.fusion.config import FusionConfig
+from lcf3d.fusion.stereo import StereoConfig
 
 
-def build_config(name_or_path: str, changes: list[str]) -> FusionConfig:
-    """Settings from a preset or file, changed by ``name=value`` items.
+def build_config(name_or_path: str, changes: list[str], stereo: bool = False) -> FusionConfig:
+    """Settings from a preset or file, changed by ``name=value`` items; those of stereo pairs if ``stereo``.
 
     Raises:
         ConfigError: unknown preset, file, setting or value.
     """
-    config = FusionConfig.load(name_or_path)
+    config = (StereoConfig if stereo else FusionConfig).load(name_or_path)
     values: dict[str, Any] = {}
     for item in changes:
         name, equals, text = item.partition("=")
         if not equals:
             raise ConfigError(f"--set takes name=value, got {item!r}")
-        values[name] = yaml.safe_load(text)
+        try:
+            values[name] = yaml.safe_load(text)
+        except yaml.YAMLError:
+            raise ConfigError(f"--set {name} cannot be read as a value: {text!r}") from None
     return config.updated(**values) if values else config

@@ -1,15 +1,17 @@
-"""Detections of another tool, read from KITTI result files: the detector kind ``results:DIR``."""
+"""Detections of another tool, read from its result files: the detector kind ``results:PATH``."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
-from lcf3d.errors import DatasetError
-from lcf3d.formats.kitti import KittiFrames, KittiObjects, detections_2d, detections_3d, read_folder
+from lcf3d.datasets.nuscenes import NuscenesDataset
+from lcf3d.errors import ConfigError, DatasetError
+from lcf3d.formats.coco import read_camera_detections
+from lcf3d.formats.kitti import KittiObjects, detections_2d, detections_3d, read_folder
 from lcf3d.structures import Detections2D, Detections3D, Frame
 
 Missing = Literal["error", "empty"]
@@ -26,12 +28,14 @@ class KittiResults:
 
     def __init__(self, folder: str | Path, class_names: Sequence[str], missing: Missing = "error") -> None:
         path = Path(folder)
+        if missing not in ("error", "empty"):
+            raise ConfigError(f"missing results are taken as error or empty, got {missing!r}")
         self.folder = path / "data" if (path / "data").is_dir() else path
         self.class_names = tuple(class_names)
         self.missing: Missing = missing
         self._frames: dict[str, KittiObjects] = {}
 
-    def load(self, frame_ids: Sequence[str]) -> KittiFrames:
+    def load(self, frame_ids: Sequence[str]) -> None:
         """Read the files of these frames.
 
         Raises:
@@ -40,7 +44,24 @@ class KittiResults:
         """
         frames = read_folder(self.folder, frame_ids, results=True, missing=self.missing)
         self._frames = dict(zip(frame_ids, frames, strict=True))
-        return frames
+
+    def require_probabilities(self, calibrated: Collection[str]) -> None:
+        """See that the scores that `load` has read lie in [0, 1], but for those of classes that are ``calibrated``.
+
+        Raises:
+            ConfigError: some do not; names the file.
+        """
+        for frame_id, objects in self._frames.items():
+            if objects.scores is None:
+                continue
+            taken = np.isin(objects.class_names, [name for name in self.class_names if name not in calibrated])
+            wrong = np.flatnonzero(taken & ~((objects.scores >= 0) & (objects.scores <= 1)))
+            if len(wrong):
+                score, name = objects.scores[wrong[0]], objects.class_names[wrong[0]]
+                raise ConfigError(
+                    f"{self.folder / frame_id}.txt: scores must lie in [0, 1], got {score:.4g} for a {name}; "
+                    "fit a calibration with 'lcf3d calibrate' and pass --calibration FILE"
+                )
 
     def objects(self, frame: Frame) -> KittiObjects:
         """The result lines of one frame, read now unless `load` has read them."""
@@ -69,9 +90,61 @@ class LidarResults(KittiResults):
 class CameraResults(KittiResults):
     """2D detections of a camera detector."""
 
+    def sees(self, frame: Frame, camera: str) -> bool:
+        """Always: a frame without detections was looked at."""
+        return True
+
     def detect(self, frame: Frame, camera: str) -> Detections2D:
         """The detections of one frame, clipped to the image of ``camera``."""
-        found = detections_2d(self.objects(frame), self.class_names)
-        view = frame.camera(camera)
-        limits = np.array([view.width, view.height, view.width, view.height], dtype=np.float64)
-        return Detections2D(np.clip(found.boxes, 0, limits), found.scores, found.labels, found.class_names)
+        return _clipped(detections_2d(self.objects(frame), self.class_names), frame, camera)
+
+
+class NuscenesLidarResults:
+    """3D detections of a nuScenes submission file.
+
+    Args:
+        path: the JSON file.
+        dataset: the samples they belong to.
+        class_names: classes to take.
+
+    Raises:
+        FormatError: not a submission, or it lacks samples.
+    """
+
+    def __init__(self, path: str | Path, dataset: NuscenesDataset, class_names: Sequence[str]) -> None:
+        self._frames = dataset.read_results(Path(path))
+        self.class_names = tuple(class_names)
+
+    def detect(self, frame: Frame) -> Detections3D:
+        """The detections of one sample in its LiDAR frame."""
+        return self._frames[frame.id].with_classes(self.class_names)
+
+
+class NuscenesCameraResults:
+    """2D detections of a JSON list by sample and camera (see ``lcf3d.formats.coco``), with masks where it has some.
+
+    Args:
+        path: the JSON file.
+        class_names: classes to take.
+
+    Raises:
+        FormatError: not such a list; names the record.
+    """
+
+    def __init__(self, path: str | Path, class_names: Sequence[str]) -> None:
+        self._found = read_camera_detections(Path(path), class_names)
+        self._empty = Detections2D.empty(class_names)
+
+    def sees(self, frame: Frame, camera: str) -> bool:
+        """Always: a camera without detections looked and saw nothing."""
+        return True
+
+    def detect(self, frame: Frame, camera: str) -> Detections2D:
+        """The detections of one camera of one sample, clipped to its image."""
+        return _clipped(self._found.get((frame.id, camera), self._empty), frame, camera)
+
+
+def _clipped(found: Detections2D, frame: Frame, camera: str) -> Detections2D:
+    view = frame.camera(camera)
+    limits = np.array([view.width, view.height, view.width, view.height], dtype=np.float64)
+    return Detections2D(np.clip(found.boxes, 0, limits), found.scores, found.labels, found.class_names, found.masks)

@@ -2,14 +2,17 @@
 
 OUT/config.yaml          the settings used
 OUT/run.json             what was run: dataset, detectors, version
-OUT/data/ID.txt          KITTI result file of a frame
+OUT/calibration.json     the score calibration used, if any
 OUT/provenance/ID.json   why each input and output of the frame is there or not
+OUT/data/ID.txt          KITTI: result file of a frame
+OUT/results.json         nuScenes: submission of all samples
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -20,6 +23,9 @@ from lcf3d.fusion.config import FusionConfig
 from lcf3d.geometry.camera import project_boxes
 from lcf3d.provenance import FusedDetections
 from lcf3d.structures import FloatArray, Frame
+
+if TYPE_CHECKING:
+    from lcf3d.datasets.nuscenes import NuscenesDataset
 
 
 class RunFolder:
@@ -32,9 +38,10 @@ class RunFolder:
     def __init__(self, path: Path | str) -> None:
         self.path = Path(path)
 
-    def result_path(self, frame_id: str) -> Path:
-        """The KITTI result file of a frame."""
-        return self.path / "data" / f"{frame_id}.txt"
+    @property
+    def calibration_path(self) -> Path:
+        """The score calibration used."""
+        return self.path / "calibration.json"
 
     def provenance_path(self, frame_id: str) -> Path:
         """The provenance file of a frame."""
@@ -60,24 +67,24 @@ class RunFolder:
                     f"{self.path} holds a run with other settings or inputs, so it cannot be resumed; "
                     "pass --overwrite or another --out"
                 )
-        if overwrite:
-            for file in (*self.path.glob("data/*.txt"), *self.path.glob("provenance/*.json")):
-                file.unlink()
+        elif occupied:
+            if not inputs.is_file():
+                raise ConfigError(f"{self.path} holds files of something else; choose another --out")
+            for file in (*self.path.glob("data/*.txt"), *self.path.glob("provenance/*.json"), self.calibration_path):
+                file.unlink(missing_ok=True)
         write_json(inputs, run)
         config.dump(settings)
 
     def is_done(self, frame_id: str) -> bool:
-        """Whether both files of a frame are there."""
-        return self.result_path(frame_id).is_file() and self.provenance_path(frame_id).is_file()
+        """Whether the files of a frame are there."""
+        return self.provenance_path(frame_id).is_file()
 
     def write(self, frame: Frame, fused: FusedDetections) -> None:
-        """Write the two files of a frame, the result last."""
+        """Write the files of a frame."""
         write_json(self.provenance_path(frame.id), fused.to_json(), indent=None)
-        camera = frame.cameras[0]
-        boxes2d = image_boxes(frame, fused)
-        write_objects(
-            self.result_path(frame.id), objects_from_detections(fused.detections, boxes2d, camera.camera_from_lidar)
-        )
+
+    def finish(self, frame_ids: Sequence[str]) -> None:
+        """Write what belongs to all frames together; nothing here."""
 
     def read(self, frame_id: str) -> FusedDetections:
         """The result of a frame with its provenance.
@@ -86,6 +93,48 @@ class RunFolder:
             FormatError: it is not there or not readable.
         """
         return FusedDetections.from_json(read_json(self.provenance_path(frame_id)))
+
+
+class KittiRunFolder(RunFolder):
+    """A run on KITTI layout, with a result file a frame."""
+
+    def result_path(self, frame_id: str) -> Path:
+        """The KITTI result file of a frame."""
+        return self.path / "data" / f"{frame_id}.txt"
+
+    def is_done(self, frame_id: str) -> bool:
+        """Whether both files of a frame are there."""
+        return self.result_path(frame_id).is_file() and super().is_done(frame_id)
+
+    def write(self, frame: Frame, fused: FusedDetections) -> None:
+        """Write the two files of a frame, the result last."""
+        super().write(frame, fused)
+        camera_from_lidar = frame.cameras[0].camera_from_lidar
+        objects = objects_from_detections(fused.detections, image_boxes(frame, fused), camera_from_lidar)
+        write_objects(self.result_path(frame.id), objects)
+
+
+class NuscenesRunFolder(RunFolder):
+    """A run on nuScenes, with one submission file of all samples.
+
+    Args:
+        path: the folder.
+        dataset: the samples.
+    """
+
+    def __init__(self, path: Path | str, dataset: NuscenesDataset) -> None:
+        super().__init__(path)
+        self.dataset = dataset
+
+    @property
+    def result_path(self) -> Path:
+        """The submission file."""
+        return self.path / "results.json"
+
+    def finish(self, frame_ids: Sequence[str]) -> None:
+        """Write the submission from the samples' provenance files; samples not run have no boxes in it."""
+        detections = {frame_id: self.read(frame_id).detections for frame_id in frame_ids}
+        self.dataset.write_results(self.result_path, detections)
 
 
 def image_boxes(frame: Frame, fused: FusedDetections) -> FloatArray:
