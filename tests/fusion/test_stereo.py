@@ -197,6 +197,19 @@ def test_object_confirmed_in_the_other_view_is_no_candidate():
     assert len(fused) == 1
 
 
+def test_one_view_of_a_pair_must_be_decisive():
+    points = surface_points([NEAR])
+    settings = {"decisive_score": 0.5, "camera_score_threshold": 0.1}
+    fused = fuse(lidar([], []), both([NEAR], (0.3, 0.8)), points, **settings)
+    assert fused.detections.scores == pytest.approx([0.8])
+    weak = fuse(lidar([], []), both([NEAR], (0.3, 0.4)), points, **settings)
+    assert [weak.camera.row(i)["reason"] for i in range(2)] == ["low_score"] * 2
+    alone = fuse(
+        lidar([], []), {**both([NEAR], (0.4, 0.8)), "right": none2d()}, points, **settings, unpaired="single_view"
+    )
+    assert [alone.camera.row(i)["reason"] for i in range(1)] == ["low_score"]
+
+
 def test_fate_of_both_detections_of_a_pair_is_one():
     found = both([NEAR, WALKER], labels=[CAR, PEDESTRIAN])
     few = fuse(lidar([], []), found, surface_points([NEAR]), [NEAR])

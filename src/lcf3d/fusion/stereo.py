@@ -168,10 +168,11 @@ class StereoLateCascadeFusion(LateCascadeFusion):
     def _pair_candidates(self, branches: Branches, candidates: list[IntArray]) -> tuple[list[IntArray], IntArray]:
         """Candidates with each pair's second view taken out, and the pairs as `recover` wants them (section 4.2.3).
 
-        The more confident detection of a pair comes first. Detections left alone are taken out and marked, or stay, as
-        ``unpaired`` says.
+        The more confident detection of a pair comes first and must be decisive. Decisive detections left alone are
+        taken out and marked, or stay, as ``unpaired`` says.
         """
         candidates, rows = list(candidates), [np.zeros((0, 4), dtype=np.int64)]
+        decisive = [found.scores > self.config.decisive_score for found in branches.camera]
         for left, right in self._pairs(branches):
             free = candidates[left], candidates[right]
             found = branches.camera[left][free[0]], branches.camera[right][free[1]]
@@ -181,6 +182,7 @@ class StereoLateCascadeFusion(LateCascadeFusion):
                 *found,
                 gate_px=self.config.epipolar_gate_px,
                 check_depth=self.config.check_depth,
+                decisive_score=self.config.decisive_score,
                 method="paper" if self.config.assignment == "paper" else "gated",
             )
             own, other = free[0][matched[:, 0]], free[1][matched[:, 1]]
@@ -192,11 +194,12 @@ class StereoLateCascadeFusion(LateCascadeFusion):
                 (right, free[1], other, ~left_first),
             ):
                 alone = np.setdiff1d(all_free, paired)
+                alone = alone[decisive[camera][alone]]
                 if self.config.unpaired == "discard":
                     self._mark(branches, camera, alone, Reason.UNPAIRED)
                     alone = alone[:0]
                 candidates[camera] = np.sort(np.concatenate([paired[kept], alone]))
-        return candidates, np.concatenate(rows)
+        return [c[good[c]] for c, good in zip(candidates, decisive, strict=True)], np.concatenate(rows)
 
     def _recover(
         self,
@@ -211,7 +214,7 @@ class StereoLateCascadeFusion(LateCascadeFusion):
         config = self.config
         candidates = []
         for c, (view, found) in enumerate(zip(views, branches.camera, strict=True)):
-            free = np.setdiff1d(np.flatnonzero(found.scores > config.decisive_score), view.match)
+            free = np.setdiff1d(np.arange(len(found)), view.match)
             elsewhere = confirmed_elsewhere(views, matches, clusters, found.boxes[free], c, config.confirm_iou)
             self._mark(branches, c, free[elsewhere], Reason.SEEN_ELSEWHERE)
             candidates.append(free[~elsewhere])
@@ -225,7 +228,7 @@ class StereoLateCascadeFusion(LateCascadeFusion):
         if points is None:
             reason = Reason.NO_SCAN if config.recovery else Reason.NO_RECOVERY
             for c, free in enumerate(candidates):
-                self._mark(branches, c, free, reason)
+                self._mark(branches, c, free[branches.camera[c].scores[free] > config.decisive_score], reason)
             candidates = [free[:0] for free in candidates]
             points = np.zeros((0, 4), np.float32)
         else:

@@ -119,6 +119,7 @@ def pair_views(
     *,
     gate_px: float,
     check_depth: bool,
+    decisive_score: float = 0.0,
     method: Assignment = "gated",
 ) -> IntArray:
     """Pairs of detections of two views that show one object: the assignment of least epipolar distance.
@@ -134,6 +135,7 @@ def pair_views(
         right_found: those of the second camera, of the same class list.
         gate_px: pairs whose mean corner distance is larger are none.
         check_depth: pairs that are not `believable_pairs` are none.
+        decisive_score: one score of a pair must be higher.
         method: see above.
 
     Returns:
@@ -145,6 +147,7 @@ def pair_views(
     # what a pair saves against two lonely boxes; the margin keeps a pair right at the gate from rounding
     saved = gate_px + 1e-6 - distance
     possible = (left_found.labels[:, None] == right_found.labels) & (saved > 0)
+    possible &= np.maximum(left_found.scores[:, None], right_found.scores) > decisive_score
     if check_depth:
         possible &= believable_pairs(left, right, left_found.boxes, right_found.boxes, gate_px)
     if method == "gated":
