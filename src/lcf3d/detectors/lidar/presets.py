@@ -172,6 +172,22 @@ def car_only(config: LidarConfig) -> LidarConfig:
     )
 
 
+def openpcdet(config: LidarConfig) -> LidarConfig:
+    """The form of OpenPCDet 0.6 of a KITTI configuration: other class order, anchors on the border, raw positions."""
+    assert config.anchors is not None
+    order = (2, 0, 1)
+    level = AnchorLevel(tuple(_KITTI_LEVEL.sizes[i] for i in order), tuple(_KITTI_LEVEL.bottoms[i] for i in order))
+    rule = config.suppression if config.proposals else Suppression(0.1, 0.01, 4096, 500)
+    return replace(
+        config,
+        name=f"{config.name}-openpcdet",
+        class_names=tuple(_KITTI_CLASSES[i] for i in order),
+        anchors=replace(config.anchors, levels=(level,), aligned=False, direction_offset=0.78539),
+        suppression=rule,
+        offsets_replace_position=False,
+    )
+
+
 PRESETS: dict[str, LidarConfig] = {
     config.name: config
     for config in (
@@ -187,6 +203,9 @@ PRESETS: dict[str, LidarConfig] = {
         PART_A2_KITTI,
         car_only(PART_A2_KITTI),
         PV_RCNN_KITTI,
+        openpcdet(POINTPILLARS_KITTI),
+        openpcdet(SECOND_KITTI),
+        openpcdet(PV_RCNN_KITTI),
     )
 }
 """Every configuration by name."""

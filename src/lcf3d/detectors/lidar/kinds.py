@@ -1,0 +1,144 @@
+"""LiDAR detectors as the command line names them: ``pointpillars:CHECKPOINT``, ``onnx-lidar:FILE`` and so on."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lcf3d.detectors.base import LidarDetector
+from lcf3d.detectors.checkpoints import detector_class, read_lidar_checkpoint
+from lcf3d.detectors.classes import class_mapping
+from lcf3d.detectors.lidar.suppression import NmsMode
+from lcf3d.structures import Detections3D
+
+
+@dataclass(frozen=True)
+class InClasses:
+    """A LiDAR detector whose detections are given in another class list; classes without a counterpart are dropped."""
+
+    detector: LidarDetector
+    class_names: tuple[str, ...]
+
+    def __call__(self, points: NDArray[np.float32]) -> Detections3D:
+        """Detections of (N, 4 or more) points."""
+        found = self.detector(points)
+        return found.with_classes(self.class_names, class_mapping(found.class_names, self.class_names))
+
+
+def load(
+    path: str,
+    class_names: Sequence[str] | None = None,
+    nms: NmsMode = "off",
+    score_threshold: float | None = None,
+    device: str = "cpu",
+    preset: str | None = None,
+    architecture: str | None = None,
+) -> LidarDetector:
+    """A LiDAR detector from a checkpoint of any of the known architectures.
+
+    Args:
+        path: checkpoint file.
+        class_names: classes of the detections; the network's own without it.
+        nms: ``off`` as in the paper, ``low`` or ``keep``.
+        score_threshold: boxes need a higher score; the network's own without it.
+        device: torch device.
+        preset: name of the configuration; found from the parameters without it.
+        architecture: what the network must be, if anything.
+
+    Raises:
+        DetectorError: the file cannot be read, or holds another network.
+    """
+    state, config = read_lidar_checkpoint(Path(path), preset, architecture)
+    options = {"nms": nms, "score_threshold": score_threshold, "device": device}
+    detector: LidarDetector = detector_class(config.architecture).from_state_dict(state, config, **options)
+    return detector if class_names is None else InClasses(detector, tuple(class_names))
+
+
+def pointpillars(
+    path: str,
+    class_names: Sequence[str] | None = None,
+    nms: NmsMode = "off",
+    score_threshold: float | None = None,
+    device: str = "cpu",
+    preset: str | None = None,
+) -> LidarDetector:
+    """PointPillars; see `load`."""
+    return load(path, class_names, nms, score_threshold, device, preset, "pointpillars")
+
+
+def second(
+    path: str,
+    class_names: Sequence[str] | None = None,
+    nms: NmsMode = "off",
+    score_threshold: float | None = None,
+    device: str = "cpu",
+    preset: str | None = None,
+) -> LidarDetector:
+    """SECOND; see `load`."""
+    return load(path, class_names, nms, score_threshold, device, preset, "second")
+
+
+def ssn(
+    path: str,
+    class_names: Sequence[str] | None = None,
+    nms: NmsMode = "off",
+    score_threshold: float | None = None,
+    device: str = "cpu",
+    preset: str | None = None,
+) -> LidarDetector:
+    """SSN; see `load`."""
+    return load(path, class_names, nms, score_threshold, device, preset, "ssn")
+
+
+def centerpoint(
+    path: str,
+    class_names: Sequence[str] | None = None,
+    nms: NmsMode = "off",
+    score_threshold: float | None = None,
+    device: str = "cpu",
+    preset: str | None = None,
+) -> LidarDetector:
+    """CenterPoint; see `load`."""
+    return load(path, class_names, nms, score_threshold, device, preset, "centerpoint")
+
+
+def part_a2(
+    path: str,
+    class_names: Sequence[str] | None = None,
+    nms: NmsMode = "off",
+    score_threshold: float | None = None,
+    device: str = "cpu",
+    preset: str | None = None,
+) -> LidarDetector:
+    """Part-A2; see `load`."""
+    return load(path, class_names, nms, score_threshold, device, preset, "part-a2")
+
+
+def pv_rcnn(
+    path: str,
+    class_names: Sequence[str] | None = None,
+    nms: NmsMode = "off",
+    score_threshold: float | None = None,
+    device: str = "cpu",
+    preset: str | None = None,
+) -> LidarDetector:
+    """PV-RCNN; see `load`."""
+    return load(path, class_names, nms, score_threshold, device, preset, "pv-rcnn")
+
+
+def onnx_lidar(
+    path: str,
+    class_names: Sequence[str] | None = None,
+    nms: NmsMode = "off",
+    score_threshold: float | None = None,
+    threads: int = 0,
+) -> LidarDetector:
+    """An exported network; see `lcf3d.detectors.lidar.onnx.OnnxLidarDetector`."""
+    from lcf3d.detectors.lidar.onnx import OnnxLidarDetector
+
+    detector = OnnxLidarDetector(path, nms=nms, score_threshold=score_threshold, threads=threads)
+    return detector if class_names is None else InClasses(detector, tuple(class_names))

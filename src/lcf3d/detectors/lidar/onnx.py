@@ -1,0 +1,88 @@
+"""An exported pillar network run by onnxruntime: no torch needed."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lcf3d.detectors.lidar.config import LidarConfig
+from lcf3d.detectors.lidar.inputs import map_detections, pillar_inputs
+from lcf3d.detectors.lidar.suppression import NmsMode, suppression_threshold
+from lcf3d.errors import ConfigError, DetectorError
+from lcf3d.structures import Detections3D
+
+CONFIG_KEY = "lcf3d.lidar_config"
+
+
+class OnnxLidarDetector:
+    """A LiDAR detector from a file that `lcf3d.detectors.lidar.export_onnx` wrote.
+
+    Args:
+        path: the file.
+        nms: ``off`` (the paper's choice), ``low`` or ``keep``.
+        score_threshold: boxes need a higher score; the network's own without one.
+        threads: threads of onnxruntime; 0 for one a core.
+
+    Raises:
+        DetectorError: the file is not such a network.
+        ConfigError: ``nms`` or ``score_threshold`` makes no sense.
+    """
+
+    def __init__(
+        self, path: Path | str, nms: NmsMode = "keep", score_threshold: float | None = None, threads: int = 0
+    ) -> None:
+        suppression_threshold(nms, 0.0)
+        if score_threshold is not None and not 0 <= score_threshold < 1:
+            raise ConfigError(f"score_threshold must be in [0, 1), got {score_threshold}")
+        self._session = _open(Path(path), threads)
+        metadata = self._session.get_modelmeta().custom_metadata_map
+        if CONFIG_KEY not in metadata:
+            raise DetectorError(f"{path} was not exported by lcf3d: it holds no {CONFIG_KEY}")
+        self.config = LidarConfig.from_dict(json.loads(metadata[CONFIG_KEY]))
+        self.nms = nms
+        self.score_threshold = self.config.suppression.score_threshold if score_threshold is None else score_threshold
+
+    @property
+    def class_names(self) -> tuple[str, ...]:
+        """The classes that labels index."""
+        return self.config.class_names
+
+    def __call__(self, points: NDArray[np.floating]) -> Detections3D:
+        """Detections in (N, 4 or more) points, as of `lcf3d.detectors.lidar.detector.TorchLidarDetector`."""
+        inputs = pillar_inputs(points, self.config)
+        if inputs is None:
+            velocities = np.zeros((0, 2)) if self.config.has_velocity else None
+            return Detections3D(np.zeros((0, 7)), np.zeros(0), np.zeros(0, np.int64), self.class_names, velocities)
+        return map_detections(self.maps(inputs), self.config, self.score_threshold, self.nms)
+
+    def maps(self, inputs: dict[str, NDArray[Any]]) -> list[Any]:
+        """The head's maps, without batch axis, from the arrays of `pillar_inputs`."""
+        names = [output.name for output in self._session.get_outputs()]
+        values = [value[0] for value in self._session.run(names, inputs)]
+        groups: dict[str, dict[str, Any]] = {}
+        for name, value in zip(names, values, strict=True):
+            group, _, kind = name.partition(".")
+            groups.setdefault(group, {})[kind] = value
+        if self.config.anchors is None:
+            return list(groups.values())
+        return [(maps["cls"], maps["reg"], maps["dir"]) for maps in groups.values()]
+
+
+def _open(path: Path, threads: int) -> Any:
+    """An onnxruntime session."""
+    import onnxruntime
+
+    if not path.is_file():
+        raise DetectorError(f"network {path} does not exist")
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = threads
+    options.log_severity_level = 3
+    try:
+        return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+    except Exception as error:
+        # onnxruntime's exceptions share no base class but Exception
+        raise DetectorError(f"{path} is not an ONNX network that onnxruntime can run: {str(error)[:160]}") from None
