@@ -180,6 +180,11 @@ def _tamper(table: str, row: int, **changes: object) -> Tables:
         ),
         (_tamper("sample_annotation", 0, size=[1, 2]), "'size' of a record cannot be read"),
         (_tamper("sample", 0, timestamp="noon"), "'timestamp' of a record cannot be read"),
+        (_tamper("ego_pose", 0, translation=[0, float("nan"), 0]), "'translation' of a record holds NaN"),
+        (_tamper("ego_pose", 0, token=["p"]), "ego_pose.json: a record's token is not text"),
+        ({**world_tables(), "calibrated_sensor": []}, "calibrated_sensor.json is empty"),
+        (_tamper("sample", 0, timestamp=10**400), "'timestamp' of a record cannot be read"),
+        ({**world_tables(), "ego_pose": [{}]}, "ego_pose.json: a record has no 'token'"),
         ({**world_tables(), "sample": [{"token": "s0"}]}, "a record has no 'timestamp'"),
         ({**world_tables(), "sample_data": [{"token": "s0"}]}, "a record has no 'calibrated_sensor_token'"),
     ],
@@ -240,6 +245,9 @@ def test_splits(world: Path, tmp_path: Path) -> None:
     names = tmp_path / "scenes.txt"
     names.write_text("scene-0103\n\nscene-9999\n")
     assert NuscenesDataset(world, split=str(names)).ids == SAMPLES
+    names.write_bytes(b"\xff\xfe")
+    with pytest.raises(DatasetError, match="not a text file"):
+        scenes_of_split(str(names))
     with pytest.raises(DatasetError, match="neither one of mini_train"):
         scenes_of_split("validation")
     with pytest.raises(DatasetError, match="holds no sample of split 'train'"):

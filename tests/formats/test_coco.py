@@ -61,6 +61,8 @@ def test_counts_survive(runs: list[int]) -> None:
         {"size": [3, 4], "counts": "\x7f"},
         {"size": [3, 4], "counts": "X"},
         {"size": [3], "counts": [12]},
+        {"size": [-3, -4], "counts": [12]},
+        {"size": [3, 4], "counts": [10**400]},
         {"counts": [12]},
         [[1, 2, 3, 4, 5, 6]],
     ],
@@ -115,6 +117,7 @@ def test_simple_list_round_trip(tmp_path: Path) -> None:
     [
         (_simple(score=float("nan")), "record 0 has a bbox or score that is NaN"),
         (_simple(bbox=[1, 2, 3]), "four numbers"),
+        (_simple(score=10**400), "record 0 must have a bbox of four numbers and a score"),
         (_simple(bbox=[1, 2, -3, 4]), "negative size"),
         ({"camera": "CAM_BACK", "bbox": [1, 2, 3, 4], "score": 1, "category_name": "car"}, "no 'sample_token'"),
         (_simple(segmentation={"size": [2, 2], "counts": [1]}), "record 0: the runs of a mask"),

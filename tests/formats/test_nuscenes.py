@@ -76,6 +76,7 @@ def test_a_submission_by_hand(tmp_path: Path) -> None:
         ({"s": [box(size=[1, 0, 1])]}, "size that is not positive"),
         ({"s": [box(rotation=[0, 0, 0, 0])]}, "rotation that is zero"),
         ({"s": [box(), box(size=[1, 2])]}, "size of a box of sample s must be 3 numbers"),
+        ({"s": [box(detection_score=10**400)]}, "detection_score of a box of sample s must be a number"),
         ({"s": [box(detection_score="high")]}, "detection_score of a box of sample s must be a number"),
         ({"s": [{"sample_token": "s"}]}, "a box of sample s has no 'translation'"),
         ({"s": [box(sample_token="t")]}, "listed under sample s carries another sample's token"),
@@ -104,6 +105,8 @@ def test_repeated_tokens_and_other_files(tmp_path: Path) -> None:
         read_submission(path)
     with pytest.raises(FormatError, match="does not exist"):
         read_submission(tmp_path / "none.json")
+    with pytest.raises(FormatError, match="cannot be read"):
+        read_submission(tmp_path)
 
 
 def test_writing_keeps_the_best_500_and_every_token(tmp_path: Path) -> None:

@@ -128,7 +128,7 @@ class _Reader:
         if not path.is_file():
             raise DatasetError(f"{path} is missing; a nuScenes table of that name is needed")
         for batch in iterate_records(path):
-            records = batch if keep is None else [record for record in batch if keep(record)]
+            records = batch if keep is None else _selected(path, batch, keep)
             for key, spec in specs.items():
                 parts[key].append(_column(path, records, key, spec))
         return {key: np.concatenate(column) for key, column in parts.items()}
@@ -165,6 +165,17 @@ class _Reader:
             )
 
 
+def _selected(
+    path: Path, records: list[dict[str, Any]], keep: Callable[[dict[str, Any]], bool]
+) -> list[dict[str, Any]]:
+    try:
+        return [record for record in records if keep(record)]
+    except KeyError as error:
+        raise DatasetError(f"{path}: a record has no {error.args[0]!r}") from None
+    except TypeError:
+        raise DatasetError(f"{path}: a record's token is not text, or it is no record") from None
+
+
 def _column(path: Path, records: list[dict[str, Any]], key: str, spec: _Spec) -> NDArray[Any]:
     getter, dtype, shape = spec
     try:
@@ -174,11 +185,13 @@ def _column(path: Path, records: list[dict[str, Any]], key: str, spec: _Spec) ->
         column = np.array(values, dtype=dtype)
     except KeyError:
         raise DatasetError(f"{path}: a record has no {key!r}") from None
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         column = np.empty(())
     if records and column.shape != (len(records), *shape):
         expected = f"{' x '.join(map(str, shape))} numbers" if shape else "one value"
         raise DatasetError(f"{path}: {key!r} of a record cannot be read, expected {expected}")
+    if spec in (_VECTOR, _QUATERNION) and not np.isfinite(column).all():
+        raise DatasetError(f"{path}: {key!r} of a record holds NaN or infinite values")
     return column.reshape(len(records), *shape)
 
 
@@ -207,6 +220,8 @@ def _read_calibrations(reader: _Reader) -> _Calibrations:
         },
     )
     own = table["token"]
+    if not len(own):
+        raise DatasetError(f"{reader.folder / 'calibrated_sensor.json'} is empty; no sensor can be placed")
     index = reader.index("calibrated_sensor", own)
     reader.require_unit("calibrated_sensor", own, table["rotation"])
     sensor_index = reader.index("sensor", sensor["token"])
@@ -241,10 +256,7 @@ def _read_recordings(reader: _Reader, calibrations: _Calibrations) -> dict[str, 
         "filename": _TEXT,
         "is_key_frame": (None, np.bool_, ()),
     }
-    try:
-        return reader.columns("sample_data", specs, wanted)
-    except KeyError as error:
-        raise DatasetError(f"{reader.folder / 'sample_data.json'}: a record has no {error.args[0]!r}") from None
+    return reader.columns("sample_data", specs, wanted)
 
 
 def _read_sensor_data(reader: _Reader, sample_index: _TokenIndex) -> SensorData:

@@ -49,7 +49,11 @@ def scenes_of_split(split: str) -> frozenset[str]:
         raise DatasetError(
             f"split {split!r} is neither one of {', '.join(SPLITS)} nor a text file with one scene name a line"
         )
-    return frozenset(line.strip() for line in path.read_text(encoding="utf-8").splitlines() if line.strip())
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except UnicodeDecodeError:
+        raise DatasetError(f"{path} is not a text file with one scene name a line") from None
+    return frozenset(line.strip() for line in lines if line.strip())
 
 
 def default_split(version: str) -> str | None:

@@ -35,9 +35,9 @@ def decode_mask(segmentation: Mapping[str, Any]) -> NDArray[np.bool_]:
         height, width = (int(n) for n in segmentation["size"])
         counts = segmentation["counts"]
         runs = np.array(unpack_counts(counts) if isinstance(counts, str | bytes) else counts, dtype=np.int64)
-    except (KeyError, TypeError, ValueError):
+    except (KeyError, TypeError, ValueError, OverflowError):
         raise FormatError("a mask must be a COCO run-length encoding {'size': [h, w], 'counts': ...}") from None
-    if runs.ndim != 1 or (runs < 0).any() or runs.sum() != height * width:
+    if height < 0 or width < 0 or runs.ndim != 1 or (runs < 0).any() or runs.sum() != height * width:
         raise FormatError(f"the runs of a mask add up to {runs.sum()} pixels, its size is {height} x {width}")
     values = np.zeros(len(runs), dtype=bool)
     values[1::2] = True
@@ -194,10 +194,10 @@ def _group(
     for i, record in enumerate(records):
         try:
             x, y, width, height = (float(n) for n in record["bbox"])
-            score, name, place = float(record["score"]), record[category], key(record)
+            score, name, place = float(record["score"]), str(record[category]), key(record)
         except KeyError as error:
             raise FormatError(f"{path}: record {i} has no {error.args[0]!r}") from None
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             raise FormatError(f"{path}: record {i} must have a bbox of four numbers and a score") from None
         if not np.isfinite([x, y, width, height, score]).all() or width < 0 or height < 0:
             raise FormatError(f"{path}: record {i} has a bbox or score that is NaN, infinite or of negative size")

@@ -48,6 +48,8 @@ def read_submission(path: Path, max_boxes: int = MAX_BOXES_PER_SAMPLE) -> tuple[
         raise FormatError(f"{path} does not exist") from None
     except UnicodeDecodeError:
         raise FormatError(f"{path} is not a text file in UTF-8") from None
+    except OSError as error:
+        raise FormatError(f"{path} cannot be read ({error.strerror})") from None
     tokens: list[str] = []
     parts: list[dict[str, Any]] = []
     meta: dict[str, Any] | None = None
@@ -122,7 +124,7 @@ def _read_sample(path: Path, token: str, boxes: Any, max_boxes: int) -> dict[str
         for key, shape in _NUMBERS.items():
             try:
                 array = np.array([box[key] for box in boxes], dtype=np.float64)
-            except (TypeError, ValueError):
+            except (TypeError, ValueError, OverflowError):
                 array = np.empty(())
             if array.shape != (len(boxes), *shape) and boxes:
                 expected = f"{shape[0]} numbers" if shape else "a number"
