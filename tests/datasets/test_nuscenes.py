@@ -124,6 +124,11 @@ def rotation_quaternion(rotation_vector: np.ndarray) -> list[float]:
     return [float(np.cos(angle / 2)), *(np.sin(angle / 2) * rotation_vector / angle).tolist()]
 
 
+def test_image_files_lead_to_samples(world: Path) -> None:
+    files = NuscenesDataset(world).image_files()
+    assert files == {f"samples/C{i}.jpg": (f"s{i}", "CAM_FRONT") for i in range(3)}
+
+
 def test_results_of_other_samples(world: Path, tmp_path: Path) -> None:
     dataset = NuscenesDataset(world)
     path = tmp_path / "results.json"

@@ -218,6 +218,16 @@ class NuscenesDataset(Sequence[Frame]):
         """(4, 4) a sample's canonical LiDAR coordinates from global ones."""
         return invert_rigid(self.global_from_lidar(token))
 
+    def image_files(self) -> dict[str, tuple[str, str]]:
+        """(sample token, camera) of every key-frame image by its path in the tables, for `read_coco_index`."""
+        data, samples = self.tables.sensor_data, self.tables.samples
+        return {
+            data.filenames[row].decode(): (token, name)
+            for token, sample in zip(self.ids, self.sample_rows, strict=True)
+            for name, row in zip(CAMERAS, samples.cameras[sample].tolist(), strict=True)
+            if row >= 0
+        }
+
     def read_results(self, path: Path) -> dict[str, Detections3D]:
         """Detections of a submission file by sample token, each in its sample's canonical LiDAR frame.
 
