@@ -33,7 +33,7 @@ OPEN_STRENGTH = 20.0
 # points that suffice for the full strength of their term
 FULL_COUNT = 30.0
 # error of a 2D box's upper and lower edge as a share of its height, and of every edge in pixels
-EDGE_DEVIATION = 0.035
+EDGE_DEVIATION = 0.05
 PIXEL_DEVIATION = 1.0
 # deviation of an object's foot from the ground plane in metres
 LIFT_DEVIATION = 0.1

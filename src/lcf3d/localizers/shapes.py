@@ -35,7 +35,7 @@ class ObjectShape:
     width_deviation: float
     height_deviation: float
     solid: bool = True
-    edge_deviation: float = 0.035
+    edge_deviation: float = 0.05
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -55,15 +55,15 @@ SHAPES: Mapping[str, ObjectShape] = MappingProxyType(
         "Tram": ObjectShape(16.17, 2.53, 3.53, 4.5, 0.13, 0.13),
         "Pedestrian": ObjectShape(0.84, 0.66, 1.76, 0.25, 0.12, 0.13, solid=False, edge_deviation=0.2),
         "Person_sitting": ObjectShape(0.80, 0.60, 1.27, 0.27, 0.1, 0.08, solid=False, edge_deviation=0.2),
-        "Cyclist": ObjectShape(1.76, 0.60, 1.74, 0.15, 0.14, 0.1, solid=False, edge_deviation=0.08),
+        "Cyclist": ObjectShape(1.76, 0.60, 1.74, 0.15, 0.14, 0.1, solid=False, edge_deviation=0.12),
         "car": ObjectShape(4.63, 1.97, 1.74, 0.46, 0.17, 0.2),
         "truck": ObjectShape(6.93, 2.51, 2.84, 1.7, 0.35, 0.6),
         "bus": ObjectShape(10.5, 2.94, 3.47, 1.5, 0.3, 0.4),
         "trailer": ObjectShape(12.29, 2.90, 3.87, 2.0, 0.4, 0.6),
         "construction_vehicle": ObjectShape(6.37, 2.85, 3.19, 1.6, 0.7, 0.7),
         "pedestrian": ObjectShape(0.73, 0.67, 1.77, 0.2, 0.13, 0.17, solid=False, edge_deviation=0.2),
-        "motorcycle": ObjectShape(2.11, 0.77, 1.47, 0.3, 0.15, 0.2, solid=False, edge_deviation=0.08),
-        "bicycle": ObjectShape(1.70, 0.60, 1.28, 0.2, 0.15, 0.25, solid=False, edge_deviation=0.08),
+        "motorcycle": ObjectShape(2.11, 0.77, 1.47, 0.3, 0.15, 0.2, solid=False, edge_deviation=0.12),
+        "bicycle": ObjectShape(1.70, 0.60, 1.28, 0.2, 0.15, 0.25, solid=False, edge_deviation=0.12),
         "traffic_cone": ObjectShape(0.41, 0.41, 1.07, 0.1, 0.1, 0.25, solid=False, edge_deviation=0.1),
         "barrier": ObjectShape(0.50, 2.53, 0.98, 0.15, 0.6, 0.15),
     }
