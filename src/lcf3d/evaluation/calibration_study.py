@@ -257,7 +257,9 @@ class CalibrationStudy:
         for label, name in enumerate(self.config.class_names):
             rows = (weighed.labels == label) & weighed.agreed & self.lidar.judged[places]
             if name in self.camera_classes and rows.sum() >= FEWEST:
-                found[name] = fit_evidence(weighed.table[rows], self.lidar.right[places[rows]])
+                recovered = self.config.evidence.get(name, Evidence()).recovered
+                right = self.lidar.right[places[rows]]
+                found[name] = fit_evidence(weighed.table[rows], right, recovered=recovered)
         return found
 
 

@@ -120,13 +120,16 @@ def _cross_validated(scores: FloatArray, right: FloatArray, folds: IntArray, kin
     return log_loss(held_out, right)
 
 
-def fit_evidence(table: FloatArray, right: FloatArray, strength: float = EVIDENCE_STRENGTH) -> Evidence:
+def fit_evidence(
+    table: FloatArray, right: FloatArray, strength: float = EVIDENCE_STRENGTH, recovered: float = 0.4
+) -> Evidence:
     """Evidence weights of a class, none negative, by maximum likelihood with a pull towards the LiDAR branch alone.
 
     Args:
         table: (N, 9) see `lcf3d.fusion.evidence.evidence_table`.
         right: (N,) 1 where the box is a true positive, 0 where it is a false one.
         strength: of the pull, see ``EVIDENCE_STRENGTH``; the constant is free.
+        recovered: handed through, see `Evidence`.
     """
     if table.shape != (len(right), len(Evidence.lidar_alone().weights)):
         raise ConfigError(f"evidence table must have shape ({len(right)}, 9), got {table.shape}")
@@ -140,7 +143,7 @@ def fit_evidence(table: FloatArray, right: FloatArray, strength: float = EVIDENC
     weights = _minimise(table / scale, right, start, pull, lowest) / scale
     # a LiDAR weight of nothing would leave the order of its boxes to chance
     weights[0] = max(weights[0], 0.05)
-    return Evidence.from_weights(np.round(weights, 4).astype(np.float64))
+    return Evidence.from_weights(np.round(weights, 4).astype(np.float64), recovered)
 
 
 def _minimise(

@@ -167,6 +167,7 @@ _PERSON = {
     "miss": 0.3,
     "off_ground": 0.0,
     "rival": 3.0,
+    "recovered": 0.7,
 }
 PRESETS: dict[str, dict[str, Any]] = {
     "paper": _PAPER,

@@ -41,6 +41,9 @@ class Evidence(BaseModel):
         support: log-odds that a certain 2D detection (score 1) adds at the IoUs of ``SUPPORT_IOU``.
         miss: log-odds lost when no camera detection matches a box that is large in the image and not cut by its edge.
         off_ground: log-odds lost by a box that floats or sinks by 5 % of its distance or more.
+        recovered: probability that a box recovered from a certain 2D detection, with image IoU 1, is right; recovered
+            scores are multiplied with it. Not fitted: it takes scans. Without it a recovered box, which the LiDAR
+            detector has missed, would rank above most confirmed ones.
         rival: log-odds lost to a certain (score 1) LiDAR box of another class, of higher score, in the same cluster.
     """
 
@@ -52,6 +55,7 @@ class Evidence(BaseModel):
     miss: Weight = 0.1
     off_ground: Weight = 2.0
     rival: Weight = 0.0
+    recovered: Annotated[float, Field(ge=0, le=1)] = 0.4
 
     @model_validator(mode="after")
     def _check_support(self) -> Evidence:
@@ -65,8 +69,8 @@ class Evidence(BaseModel):
         return cls(base=0, trust=1, support=(0, 0, 0, 0), miss=0, off_ground=0, rival=0)
 
     @classmethod
-    def from_weights(cls, weights: FloatArray) -> Evidence:
-        """The inverse of `weights`."""
+    def from_weights(cls, weights: FloatArray, recovered: float = 0.4) -> Evidence:
+        """The inverse of `weights`; ``recovered`` is not among them."""
         trust, rival, off_ground, miss, *steps, base = (float(w) for w in weights)
         support = np.cumsum(steps)
         return cls(
@@ -76,6 +80,7 @@ class Evidence(BaseModel):
             miss=miss,
             off_ground=off_ground,
             rival=rival,
+            recovered=recovered,
         )
 
     @property

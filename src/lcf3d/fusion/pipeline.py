@@ -20,7 +20,7 @@ from lcf3d.fusion.outcome import (
     replace_unconfirmed,
 )
 from lcf3d.fusion.recovery import Recovery, recover
-from lcf3d.fusion.weighing import Weighed, fused_scores, weigh_clusters
+from lcf3d.fusion.weighing import Weighed, fused_scores, recovered_trust, weigh_clusters
 from lcf3d.localizers.base import Localizer
 from lcf3d.provenance import FusedDetections, Reason, Stage
 from lcf3d.structures import BoolArray, Detections2D, Detections3D, FloatArray, Frame, IntArray
@@ -193,7 +193,14 @@ class LateCascadeFusion:
             confirm_iou=config.confirm_iou,
             duplicate_iou=config.duplicate_iou,
         )
-        return recovery, notes
+        return self._trust_recovered(recovery), notes
+
+    def _trust_recovered(self, recovery: Recovery) -> Recovery:
+        """Scores of recovered boxes as probabilities, where those of the others are: see `Evidence`."""
+        if self.config.ensemble != "evidence":
+            return recovery
+        trust = recovered_trust(self.config, self.calibration)
+        return recovery._replace(scores=recovery.scores * trust[recovery.labels])
 
     def _confirmed(self, branches: Branches, outcome: ClusterOutcome) -> FloatArray:
         """Boxes that a recovered one may not double: matched ones, and those kept where no camera looks."""

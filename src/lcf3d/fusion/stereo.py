@@ -251,7 +251,7 @@ class StereoLateCascadeFusion(LateCascadeFusion):
             pairs=pairs,
         )
         _note_pairs(branches, recovery)
-        return recovery, notes
+        return self._trust_recovered(recovery), notes
 
 
 def _rows(branches: Branches, camera: int, detections: IntArray) -> IntArray:

@@ -73,9 +73,18 @@ def fused_scores(weighed: Weighed, config: FusionConfig, calibration: Calibratio
     scores = np.zeros(len(weighed.box))
     for label, name in enumerate(config.class_names):
         own = weighed.labels == label
-        evidence = calibration.evidence.get(name) or config.evidence.get(name) or Evidence()
-        scores[own] = to_probability(weighed.table[own] @ evidence.weights)
+        scores[own] = to_probability(weighed.table[own] @ evidence_of(name, config, calibration).weights)
     return scores
+
+
+def evidence_of(name: str, config: FusionConfig, calibration: Calibration) -> Evidence:
+    """The weights of a class: those of the calibration, else those of the settings, else the defaults."""
+    return calibration.evidence.get(name) or config.evidence.get(name) or Evidence()
+
+
+def recovered_trust(config: FusionConfig, calibration: Calibration) -> FloatArray:
+    """(L,) by class, what scores of recovered boxes are multiplied with, see `Evidence`."""
+    return np.array([evidence_of(name, config, calibration).recovered for name in config.class_names])
 
 
 def rival_scores(boxes: FloatArray, scores: FloatArray, labels: IntArray, config: FusionConfig) -> FloatArray:
