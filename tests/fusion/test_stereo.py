@@ -308,6 +308,23 @@ def test_exchanged_detections_are_refused():
         fuse(lidar([], []), {"left": found["right"], "right": found["left"]}, epipolar_gate_px=3)
 
 
+@pytest.mark.parametrize("ensemble", ["evidence", "none"])
+def test_other_ensembles_are_those_of_the_more_confident_view(ensemble):
+    found = both([NEAR], (0.9, 0.6))
+    stereo = fuse(lidar([NEAR], [0.8]), found, ensemble=ensemble)
+    single = fuse(lidar([NEAR], [0.8]), {"left": found["left"]}, ensemble=ensemble)
+    assert stereo.detections.scores == pytest.approx(single.detections.scores)
+    assert stereo.lidar.row(0)["pair"] == 1
+
+
+def test_recovered_boxes_are_trusted_as_much_as_with_one_view():
+    found = both([NEAR], (0.9, 0.9))
+    stereo = fuse(lidar([], []), found, surface_points([NEAR]), ensemble="evidence")
+    single = fuse(lidar([], []), {"left": found["left"]}, surface_points([NEAR]), ensemble="evidence")
+    assert 0 < stereo.detections.scores[0] < 0.9
+    assert stereo.detections.scores == pytest.approx(single.detections.scores)
+
+
 @pytest.mark.parametrize("name", ["paper", "kitti", "nuscenes"])
 def test_settings_survive_a_file(name, tmp_path):
     config = StereoConfig.preset(name)

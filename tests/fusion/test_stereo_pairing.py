@@ -176,3 +176,10 @@ def test_exchanged_detections_are_refused():
     )
     also = replace(left, boxes=np.concatenate([left.boxes, [[501.0, 190, 513, 196]]]), scores=[0.9] * 4, labels=[0] * 4)
     check_not_exchanged(*views, far, also, 10.0)
+
+
+def test_the_same_detections_for_both_views_are_refused():
+    views = rig()
+    left = seen(views[0], [car(12, 2), car(18, -3), car(25, 4)], [0.9] * 3)
+    with pytest.raises(Lcf3dError, match="both views have the same 3 boxes"):
+        check_not_exchanged(*views, left, left, 10.0)

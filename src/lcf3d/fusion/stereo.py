@@ -146,7 +146,7 @@ class StereoLateCascadeFusion(LateCascadeFusion):
         """Multiply in ``s2d / p`` of the second view of clusters matched in both, and note the views as a pair.
 
         With ``ensemble: evidence`` scores stay: what two views of one detector say is not independent, and the weights
-        were fitted for one.
+        were fitted for one; with ``none`` no camera changes a score.
         """
         priors = self.config.prior_array()
         for first, second in (pair, _Pair(pair.right, pair.left)):

@@ -162,16 +162,22 @@ def pair_views(
 def check_not_exchanged(
     left: Camera, right: Camera, left_found: Detections2D, right_found: Detections2D, gate_px: float
 ) -> None:
-    """Refuse detections that fit the cameras only with the two views exchanged.
+    """Refuse detections that fit the cameras only with the two views exchanged, or are one view's twice.
 
     A gate of a third is taken, so that only what fits well speaks; it never did so on frames in order
     (benchmarks/stereo_pairing.py).
 
     Raises:
-        ConfigError: there are no pairs, but `EXCHANGED_PAIRS` or more when the views are exchanged.
+        ConfigError: both views have the same boxes; or there are no pairs, but `EXCHANGED_PAIRS` or more when the views
+            are exchanged.
     """
     if min(len(left_found), len(right_found)) < EXCHANGED_PAIRS:
         return
+    if np.array_equal(left_found.boxes, right_found.boxes):
+        raise ConfigError(
+            f"stereo pair {left.name}/{right.name}: both views have the same {len(left_found)} boxes; give each camera "
+            "its own images or detections"
+        )
     as_given = pair_views(left, right, left_found, right_found, gate_px=gate_px / 3, check_depth=True)
     if len(as_given):
         return
