@@ -19,6 +19,7 @@ class Timing:
         repeats: calls measured.
         budget_ms: what it is allowed to take, or None.
         reference_ms: median milliseconds of a plain reference in the same run, or None.
+        items: frames that one call works on.
     """
 
     name: str
@@ -27,6 +28,7 @@ class Timing:
     repeats: int
     budget_ms: float | None = None
     reference_ms: float | None = None
+    items: int = 1
 
     @property
     def speedup(self) -> float | None:
@@ -61,8 +63,9 @@ def timed(
     budget_ms: float | None = None,
     reference: Callable[[], Any] | None = None,
     seconds: float = 1.0,
+    items: int = 1,
 ) -> Timing:
     """A `Timing` of ``call`` and, if given, of a reference that does the same."""
     median, best, repeats = measure(call, seconds)
     reference_ms = measure(reference, seconds, least=3)[0] if reference is not None else None
-    return Timing(name, median, best, repeats, budget_ms, reference_ms)
+    return Timing(name, median, best, repeats, budget_ms, reference_ms, items)

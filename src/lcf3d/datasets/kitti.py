@@ -6,7 +6,7 @@ Any subset of the sensor folders may be there. Camera ``left`` is the left colou
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from lcf3d.datasets.images import ImageFiles, image_size
 from lcf3d.errors import DatasetError, FormatError
 from lcf3d.formats.kitti import detections_3d, read_frame_ids, read_objects
 from lcf3d.structures import KITTI_CLASSES, Camera, Detections3D, FloatArray, Frame
@@ -29,7 +30,6 @@ IMAGE_SIZES = {
     718.856: (1241, 376),
 }
 DEFAULT_IMAGE_SIZE = (1242, 375)
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,47 +108,6 @@ def read_points(path: Path) -> NDArray[np.float32]:
     return points
 
 
-def read_image(path: Path, size: tuple[int, int] | None = None) -> NDArray[np.uint8]:
-    """(H, W, 3) uint8 RGB image.
-
-    Args:
-        path: any format that Pillow reads.
-        size: expected (width, height), or None.
-
-    Raises:
-        DatasetError: the file does not exist.
-        FormatError: it is no image, or not of the expected size.
-    """
-    from PIL import Image, UnidentifiedImageError
-
-    try:
-        with Image.open(path) as image:
-            pixels = np.asarray(image.convert("RGB"))
-    except FileNotFoundError:
-        raise DatasetError(f"image {path} does not exist") from None
-    except (UnidentifiedImageError, OSError) as error:
-        raise FormatError(f"{path} cannot be read as an image ({error})") from None
-    if size is not None and pixels.shape[1::-1] != size:
-        width, height = pixels.shape[1::-1]
-        raise FormatError(f"{path} is {width} x {height} pixels, but its camera is {size[0]} x {size[1]}")
-    return pixels
-
-
-def image_size(path: Path) -> tuple[int, int]:
-    """(width, height) in pixels, from the file's header alone.
-
-    Raises:
-        FormatError: it is no image.
-    """
-    from PIL import Image, UnidentifiedImageError
-
-    try:
-        with Image.open(path) as image:
-            return image.size
-    except (UnidentifiedImageError, OSError) as error:
-        raise FormatError(f"{path} cannot be read as an image ({error})") from None
-
-
 def _check_image_size(path: Path, size: tuple[int, int], projection: FloatArray) -> None:
     """Refuse an image that was resized without its calibration: the principal point leaves the middle of the image."""
     for length, centre, name in zip(size, projection[:2, 2], ("width", "height"), strict=True):
@@ -157,22 +116,6 @@ def _check_image_size(path: Path, size: tuple[int, int], projection: FloatArray)
                 f"{path} is {size[0]} x {size[1]} pixels, but its calibration puts the image centre at "
                 f"({projection[0, 2]:.0f}, {projection[1, 2]:.0f}): wrong {name}; use the original image"
             )
-
-
-class _Images(Mapping[str, NDArray[np.uint8]]):
-    """Images of one frame by camera name, read when asked for."""
-
-    def __init__(self, paths: Mapping[str, Path]) -> None:
-        self._paths = paths
-
-    def __getitem__(self, name: str) -> NDArray[np.uint8]:
-        return read_image(self._paths[name])
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._paths)
-
-    def __len__(self) -> int:
-        return len(self._paths)
 
 
 class KittiDataset(Sequence[Frame]):
@@ -288,6 +231,6 @@ class KittiDataset(Sequence[Frame]):
             frame_id,
             points=(lambda: read_points(scan)) if scan else None,
             cameras=cameras,
-            images=_Images(images),
+            images=ImageFiles(images),
             labels=labels if label else None,
         )

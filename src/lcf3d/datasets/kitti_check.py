@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from lcf3d.datasets.check import Finding
-from lcf3d.datasets.kitti import KittiDataset, read_image
+from lcf3d.datasets.images import read_image
+from lcf3d.datasets.kitti import KittiDataset
 from lcf3d.errors import Lcf3dError
 from lcf3d.formats.kitti import KittiObjects, read_objects
 from lcf3d.geometry.boxes import points_in_boxes

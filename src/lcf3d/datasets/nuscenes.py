@@ -9,7 +9,7 @@ Cameras and LiDAR of a sample are recorded at different times while the vehicle 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -17,7 +17,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from lcf3d.datasets.kitti import read_image
+from lcf3d.datasets.images import ImageFiles
 from lcf3d.datasets.nuscenes_annotations import ground_truth_boxes
 from lcf3d.datasets.nuscenes_loading import load_tables
 from lcf3d.datasets.nuscenes_splits import scenes_of_split
@@ -154,7 +154,7 @@ class NuscenesDataset(Sequence[Frame]):
             token,
             points=(lambda: self.points(token)) if self._path(self._lidar_row(token)).is_file() else None,
             cameras=cameras,
-            images=_Images(images),
+            images=ImageFiles(images),
             labels=(lambda: self.labels(token)) if len(self.tables.annotations.tokens) else None,
         )
 
@@ -298,19 +298,3 @@ def find_version(root: Path) -> str:
         there = f"several ({', '.join(versions)}); name one" if versions else "none"
         raise DatasetError(f"{root} should hold one folder of nuScenes tables such as v1.0-mini, there are {there}")
     return versions[0]
-
-
-class _Images(Mapping[str, NDArray[np.uint8]]):
-    """Images of one frame by camera name, read when asked for."""
-
-    def __init__(self, paths: Mapping[str, Path]) -> None:
-        self._paths = paths
-
-    def __getitem__(self, name: str) -> NDArray[np.uint8]:
-        return read_image(self._paths[name])
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._paths)
-
-    def __len__(self) -> int:
-        return len(self._paths)

@@ -280,7 +280,7 @@ def test_images_of_the_wrong_kind(tmp_path: Path) -> None:
     [("yolox_nano", "yolox"), ("deimv2_femto", "detr"), ("yolov8n-seg_int8", "ultralytics")],
 )
 def test_real_weights_find_the_cars_of_a_real_frame(shared: Path, weights: Path, file: str, layout: str) -> None:
-    from lcf3d.datasets.kitti import read_image
+    from lcf3d.datasets.images import read_image
     from lcf3d.formats.kitti import detections_2d, read_objects
     from lcf3d.geometry.iou import image_iou
 
