@@ -1,0 +1,138 @@
+"""Faster R-CNN of OpenMMLab checkpoints: the original's maps with parameters filled by rule, and its parts by hand."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+pytest.importorskip("torchvision")
+
+from lcf3d.detectors.camera.torchvision_boxes import (  # noqa: E402
+    anchor_grid,
+    decode_boxes,
+    roi_features,
+    select_detections,
+)
+from lcf3d.detectors.camera.torchvision_fasterrcnn import (  # noqa: E402
+    STYLES,
+    FasterRCNNNetwork,
+    TorchvisionFasterRCNN,
+    find_style,
+)
+from lcf3d.errors import ConfigError, DetectorError, ShapeError  # noqa: E402
+
+
+def filled_state(folder, name):
+    spec = importlib.util.spec_from_file_location("fill", folder / "fill.py")
+    fill = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(fill)
+    shapes = json.loads((folder / f"{name}.shapes.json").read_text())
+    return {key: torch.from_numpy(value) for key, value in fill.fill_state_dict(shapes).items()}
+
+
+@pytest.mark.real
+@pytest.mark.parametrize("name", ["fasterrcnn_kitti", "fasterrcnn_nus"])
+@torch.inference_mode()
+def test_the_original_maps(shared, name):
+    folder = shared / "golden" / "models"
+    info = json.loads((folder / f"{name}.json").read_text())
+    with np.load(folder / f"{name}.npz") as file:
+        data = dict(file)
+    detector = TorchvisionFasterRCNN.from_state_dict(filled_state(folder, name))
+    network = detector.network
+    rgb = torch.from_numpy(data["input"][..., ::-1].copy()).permute(2, 0, 1)[None].float()
+
+    def check(stage, value):
+        expected = info["maps"][stage]
+        assert list(value.shape) == expected["shape"], stage
+        found = value.double().numpy().ravel()[data[f"map.{stage}.index"]]
+        wanted = data[f"map.{stage}.value"]
+        assert (np.abs(found - wanted) / np.maximum(np.abs(wanted), expected["std"])).max() < 1e-4, stage
+
+    maps = network.backbone(detector.normalize(rgb))
+    for i, value in enumerate(maps):
+        check(f"backbone.{i}", value)
+    maps = network.neck(maps)
+    for i, value in enumerate(maps):
+        check(f"neck.{i}", value)
+    for kind, values in enumerate(network.rpn_head(maps)):
+        for i, value in enumerate(values):
+            check(f"rpn_head.{kind}.{i}", value)
+    # the scores of both stages are 1 in float32: which regions of equal score come first is not defined
+    height, width = data["input"].shape[:2]
+    pooled = roi_features(maps[:4], network.regions(maps, height, width), (4, 8, 16, 32))
+    expected = info["maps"]["roi_head.bbox_roi_extractor"]
+    assert list(pooled.shape) == expected["shape"]
+    assert float(pooled.std()) == pytest.approx(expected["std"], rel=0.01)
+    if name == "fasterrcnn_nus":
+        scores, boxes = network(detector.normalize(rgb), height, width)
+        found = select_detections(boxes.numpy(), scores.numpy(), 0.05, 0.5, soft=False)
+        wanted = data["prediction.bboxes"]
+        np.testing.assert_allclose(sorted(found[0].tolist()), sorted(wanted.tolist()), atol=0.05)
+        assert set(found[2]) == set(data["prediction.labels"])
+
+
+@pytest.fixture(scope="module")
+def random_file(tmp_path_factory):
+    torch.manual_seed(0)
+    path = tmp_path_factory.mktemp("weights") / "fasterrcnn.pth"
+    torch.save({"state_dict": FasterRCNNNetwork(50, STYLES["nuscenes"]).state_dict()}, path)
+    return path
+
+
+def test_a_checkpoint_runs_and_keeps_pixels_of_the_image(random_file):
+    detector = TorchvisionFasterRCNN(random_file, class_names=("Car", "Pedestrian", "Cyclist"), score_threshold=0.0)
+    detector.style = replace(detector.style, image_size=(320, 320))
+    found = detector([np.zeros((90, 160, 3), np.uint8)])[0]
+    assert found.class_names == ("Car", "Pedestrian", "Cyclist")
+    assert len(found) > 0
+    assert found.boxes.min() >= 0
+    assert found.boxes[:, 2].max() <= 160
+    assert found.boxes[:, 3].max() <= 90
+    with pytest.raises(ShapeError, match=r"\(H, W, 3\)"):
+        detector([np.zeros((90, 160), np.uint8)])
+
+
+def test_checkpoints_of_other_networks(random_file):
+    with pytest.raises(DetectorError, match=r"lacks roi_head\.bbox_head\.fc_cls\.weight"):
+        TorchvisionFasterRCNN.from_state_dict({"weight": torch.ones(1)})
+    state = torch.load(random_file, weights_only=True)["state_dict"]
+    with pytest.raises(DetectorError, match=r"80 classes and 3 anchors"):
+        find_style({**state, "roi_head.bbox_head.fc_cls.weight": torch.ones(81, 1024)})
+    with pytest.raises(DetectorError, match="1 missing: neck"):
+        TorchvisionFasterRCNN.from_state_dict({k: v for k, v in state.items() if k != "neck.fpn_convs.3.conv.bias"})
+    with pytest.raises(ConfigError, match="style must be one of"):
+        TorchvisionFasterRCNN.from_state_dict(state, style="coco")
+
+
+def test_anchors_by_hand():
+    anchors = anchor_grid((1, 2), 4, 8, (0.25, 1.0))
+    assert anchors.tolist() == [[-32, -8, 32, 8], [-16, -16, 16, 16], [-28, -8, 36, 8], [-12, -16, 20, 16]]
+
+
+def test_residuals_by_hand():
+    boxes = decode_boxes(torch.tensor([[10.0, 10, 30, 20]]), torch.tensor([[0.5, -1.0, float(np.log(2)), 0.0]]))
+    torch.testing.assert_close(boxes, torch.tensor([[10.0, 0, 50, 10]]))
+
+
+def test_regions_are_pooled_from_the_map_of_their_size():
+    maps = [torch.full((1, 1, 64 // 2**i, 64 // 2**i), float(i)) for i in range(4)]
+    regions = torch.tensor([[0.0, 0, 50, 50], [0, 0, 120, 120], [0, 0, 256, 250]])
+    assert roi_features(maps, regions, (4, 8, 16, 32)).mean(dim=(1, 2, 3)).tolist() == [0, 1, 2]
+
+
+def test_hard_and_soft_selection():
+    boxes = np.array([[0.0, 0, 10, 10], [0, 0, 10, 9], [50, 50, 60, 60]])[:, None]
+    scores = np.array([[0.9], [0.8], [0.04]])
+    kept, values, labels = select_detections(boxes, scores, 0.05, 0.5, soft=False)
+    assert kept.tolist() == [[0, 0, 10, 10]]
+    assert labels.tolist() == [0]
+    _, values, _ = select_detections(boxes, scores, 0.05, 0.5, soft=True)
+    np.testing.assert_allclose(values, [0.9, 0.8 * (1 - 0.9)])
+    none = select_detections(boxes, scores, 0.95, 0.5, soft=True)
+    assert none[0].shape == (0, 4)
