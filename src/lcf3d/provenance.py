@@ -47,6 +47,7 @@ class Reason(IntEnum):
     NOT_JUDGED = 20
     SECOND_VIEW = 21
     UNPAIRED = 22
+    POOR_FIT = 23
 
 
 REASON_TEXT = {
@@ -62,6 +63,7 @@ REASON_TEXT = {
     Reason.REPLACED: "a box recovered from a camera detection stands in its place",
     Reason.LOCALIZED: "the frustum localizer found the object that the LiDAR detector missed",
     Reason.FEW_POINTS: "its frustum holds too few LiDAR points",
+    Reason.POOR_FIT: "the localized box fits the points in its frustum poorly",
     Reason.NOT_LOCALIZED: "the localizer found no object in its frustum",
     Reason.DISAGREES: "the localized box, projected, does not overlap it enough",
     Reason.DUPLICATE: "the localized box overlaps a confirmed one",
@@ -92,6 +94,7 @@ class Decisions:
         camera_score: score of the 2D detection before fusion.
         score: score after fusion.
         output: index of the output detection this input led to.
+        quality: how good the localizer believed its fit to be (camera rows).
         pair: row of the camera table with the other view's detection of the same object, where a stereo pair has two.
     """
 
@@ -107,6 +110,7 @@ class Decisions:
     score: FloatArray
     output: IntArray
     pair: IntArray
+    quality: FloatArray
 
     @classmethod
     def blank(cls, n: int) -> Decisions:
@@ -125,6 +129,7 @@ class Decisions:
             score=nan.copy(),
             output=none.copy(),
             pair=none.copy(),
+            quality=nan.copy(),
         )
 
     def __len__(self) -> int:
@@ -139,7 +144,7 @@ class Decisions:
         for name in ("cluster", "lidar", "camera", "detection", "output", "pair"):
             value = int(getattr(self, name)[index])
             result[name] = value if value >= 0 else None
-        for name in ("iou", "lidar_score", "camera_score", "score"):
+        for name in ("iou", "lidar_score", "camera_score", "score", "quality"):
             number = float(getattr(self, name)[index])
             result[name] = None if np.isnan(number) else number
         return result
@@ -201,7 +206,22 @@ class FusedDetections:
     def explain(self, output: int) -> str:
         """One sentence on why output ``output`` is there, with the numbers that decided."""
         table, row = self._origin(output)
-        reason = REASON_TEXT[Reason(table.reason[row])]
+        label = self.detections.class_names[self.detections.labels[output]]
+        return f"{label} {self.detections.scores[output]:.2f}, {self._because(table, row)}"
+
+    def explain_lidar(self, index: int) -> str:
+        """One sentence on what became of LiDAR detection ``index`` of those given."""
+        label = self.lidar_inputs.class_names[self.lidar_inputs.labels[index]]
+        return f"{label} {self.lidar_inputs.scores[index]:.2f}, {self._because(self.lidar, index)}"
+
+    def explain_camera(self, row: int) -> str:
+        """One sentence on what became of the 2D detection in row ``row`` of ``camera``."""
+        found = self.camera_inputs[self.camera.camera[row]]
+        index = self.camera.detection[row]
+        return f"{found.class_names[found.labels[index]]} {found.scores[index]:.2f}, {self._because(self.camera, row)}"
+
+    def _because(self, table: Decisions, row: int) -> str:
+        """Stage, reason, and where a row comes from, in words."""
         parts = []
         if table.lidar[row] >= 0:
             parts.append(f"LiDAR detection {table.lidar[row]} (score {table.lidar_score[row]:.2f})")
@@ -210,9 +230,10 @@ class FusedDetections:
         if table.pair[row] >= 0:
             parts.append(self._camera_text(self.camera, int(table.pair[row])))
         overlap = "" if np.isnan(table.iou[row]) else f", image IoU {table.iou[row]:.2f}"
-        label = self.detections.class_names[self.detections.labels[output]]
+        if not np.isnan(table.quality[row]):
+            overlap += f", fit {table.quality[row]:.2f}"
         stage = Stage(table.stage[row]).name.lower()
-        return f"{label} {self.detections.scores[output]:.2f}, {stage}: {reason}; from {' and '.join(parts)}{overlap}"
+        return f"{stage}: {REASON_TEXT[Reason(table.reason[row])]}; from {' and '.join(parts)}{overlap}"
 
     def _camera_text(self, table: Decisions, row: int) -> str:
         """The 2D detection of a row in words."""
@@ -262,9 +283,8 @@ def _detections_to_json(detections: Detections2D | Detections3D) -> dict[str, An
         "class_names": list(detections.class_names),
     }
     if isinstance(detections, Detections3D) and detections.velocities is not None:
-        unknown = np.isnan(detections.velocities).any(axis=1)
-        velocities = np.round(detections.velocities, 5).tolist()
-        value["velocities"] = [None if u else v for u, v in zip(unknown, velocities, strict=True)]
+        velocities = np.round(detections.velocities, 5)
+        value["velocities"] = [None if np.isnan(v).any() else v.tolist() for v in velocities]
     if isinstance(detections, Detections3D) and detections.attributes is not None:
         value["attributes"] = detections.attributes.tolist()
     return value

@@ -48,6 +48,8 @@ def test_matched_recovered_and_dropped():
     assert fused.lidar.row(1)["stage"] == "dropped"
     assert fused.lidar.row(1)["reason"] == "unconfirmed"
     assert "image IoU 1.00" in fused.explain(1 - walker)
+    assert fused.explain_lidar(1).startswith("Car 0.60, dropped: it is in view of a camera and no camera detection")
+    assert fused.explain_camera(1).startswith("Pedestrian 0.80, recovered: the frustum localizer found the object")
 
 
 def test_scores_of_a_match_are_the_ensemble():
@@ -132,6 +134,16 @@ def test_recovered_box_must_project_onto_its_detection():
     assert 0 < fused.camera.row(0)["iou"] < 0.3
 
 
+@pytest.mark.parametrize(("quality", "reason"), [(0.29, "poor_fit"), (0.3, "localized")])
+def test_quality_of_the_fit_is_asked_for(quality, reason):
+    doubtful = LateCascadeFusion(
+        FusionConfig(), lambda p: (p.frustum_from_lidar(np.array([NEAR])), np.full(len(p), quality))
+    )
+    fused = doubtful(frame([camera()], surface_points([NEAR])), lidar([], []), {"left": seen(camera(), [NEAR], [0.9])})
+    assert fused.camera.row(0)["reason"] == reason
+    assert fused.camera.row(0)["quality"] == quality
+
+
 def test_localizer_without_an_answer():
     mute = LateCascadeFusion(FusionConfig(), lambda p: (np.full((len(p), 7), np.nan), np.zeros(len(p))))
     fused = mute(frame([camera()], surface_points([NEAR])), lidar([], []), {"left": seen(camera(), [NEAR], [0.9])})
@@ -140,7 +152,7 @@ def test_localizer_without_an_answer():
 
 def test_localizer_of_the_wrong_shape_is_named():
     wrong = LateCascadeFusion(FusionConfig(), lambda p: (np.zeros((len(p), 6)), np.zeros(len(p))))
-    with pytest.raises(Lcf3dError, match=r"boxes of shape \(1, 7\), got \(1, 6\)"):
+    with pytest.raises(Lcf3dError, match=r"boxes of shape \(1, 7\) and as many qualities, got \(1, 6\)"):
         wrong(frame([camera()], surface_points([NEAR])), lidar([], []), {"left": seen(camera(), [NEAR], [0.9])})
 
 

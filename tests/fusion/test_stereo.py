@@ -215,7 +215,7 @@ def test_fate_of_both_detections_of_a_pair_is_one():
     few = fuse(lidar([], []), found, surface_points([NEAR]), [NEAR])
     assert [few.camera.row(i)["reason"] for i in range(4)] == ["localized", "few_points"] * 2
     mute = fuse(
-        lidar([], []), found, surface_points([NEAR, WALKER]), localizer=lambda p: (np.full((2, 7), np.nan), None)
+        lidar([], []), found, surface_points([NEAR, WALKER]), localizer=lambda p: (np.full((2, 7), np.nan), np.zeros(2))
     )
     assert [mute.camera.row(i)["reason"] for i in range(4)] == ["not_localized"] * 4
 

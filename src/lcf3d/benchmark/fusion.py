@@ -104,6 +104,7 @@ def _recovery(localizer: Localizer, seconds: float) -> Timing:
             mask_mode=config.mask_mode,
             confirm_iou=config.confirm_iou,
             duplicate_iou=config.duplicate_iou,
+            min_quality=config.min_quality,
         )
 
     return timed("detection recovery, 5 frustums, geometric", ours, budget_ms=RECOVERY_BUDGET_MS, seconds=seconds)

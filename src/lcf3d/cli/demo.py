@@ -61,8 +61,21 @@ def _print(result: DemoResult, paths: list[Path]) -> None:
         )
     console = Console()
     console.print(table)
-    fused = max(result.fused, key=len)
-    console.print(f"\nfusion: {result.fusion_ms:.1f} ms a frame (median). Why the boxes of one frame are there:")
-    for i in range(min(len(fused), 4)):
-        console.print(f"  {fused.explain(i)}", soft_wrap=True)
+    console.print(f"\nfusion: {result.fusion_ms:.1f} ms a frame (median). Some of its decisions:")
+    for sentence in _examples(result):
+        console.print(f"  {sentence}", soft_wrap=True)
     console.print(f"\npictures: {paths[0].parent}/ (frame by frame, and {paths[-1].name})", soft_wrap=True)
+
+
+def _examples(result: DemoResult) -> list[str]:
+    """A sentence on a matched, a recovered and a dropped box of the frame with most recovered ones."""
+    import numpy as np
+
+    from lcf3d.provenance import Stage
+
+    fused = max(result.fused, key=lambda f: int((f.stages == Stage.RECOVERED).sum()))
+    chosen = [i for stage in (Stage.MATCHED, Stage.RECOVERED) for i in np.flatnonzero(fused.stages == stage)[:2]]
+    dropped = fused.dropped_lidar[np.argsort(-fused.lidar_inputs.scores[fused.dropped_lidar])][:2]
+    name = result.frames[result.fused.index(fused)].frame.id
+    sentences = [fused.explain(int(i)) for i in chosen] + [fused.explain_lidar(int(i)) for i in dropped]
+    return [f"frame {name}: {sentence}" for sentence in sentences]

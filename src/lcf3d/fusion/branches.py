@@ -91,7 +91,7 @@ def _select(
 ) -> tuple[Decisions, IntArray]:
     """A table with the reason of what is left out, and the indices of what takes part."""
     scores = detections.scores
-    if len(scores) and not (np.nanmin(scores) >= 0 and np.nanmax(scores) <= 1 and np.isfinite(scores).all()):
+    if len(scores) and not (np.min(scores) >= 0 and np.max(scores) <= 1):  # NaN fails both
         raise ConfigError(
             f"{who} scores must lie in [0, 1], got {np.min(scores):.4g} to {np.max(scores):.4g}; "
             "fit a calibration with 'lcf3d calibrate' and pass it"

@@ -60,6 +60,7 @@ class FusionConfig(BaseModel):
     min_points: int = Field(default=10, ge=1, description="p_min: fewest points of a frustum")
     mask_mode: Literal["box", "mask", "box+mask"] = Field(default="box", description="how instance masks are used")
     confirm_iou: Fraction = Field(default=0.3, description="tau_d: image IoU that confirms a recovered box")
+    min_quality: Fraction = Field(default=0.3, description="least quality of the localizer's fit that is confirmed")
     duplicate_iou: Fraction = Field(
         default=0.1, description="BEV IoU with a confirmed box that makes a recovered one a double"
     )
@@ -157,6 +158,7 @@ _PAPER: dict[str, Any] = {
     "unmatched": "drop",
     "out_of_view": "drop",
     "ensemble": "product",
+    "min_quality": 0.0,
 }
 # measured: docs/when-fusion-helps.md
 _CAR = Evidence().model_dump()

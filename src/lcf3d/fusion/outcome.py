@@ -231,7 +231,7 @@ def _write_recovery_rows(branches: Branches, recovery: Recovery, outputs: IntArr
     rows = np.array(
         [starts[c] + branches.camera_index[c][d] for c, d in zip(recovery.camera, recovery.detection, strict=True)]
     )
-    table.reason[rows], table.iou[rows] = recovery.reason, recovery.iou
+    table.reason[rows], table.iou[rows], table.quality[rows] = recovery.reason, recovery.iou, recovery.quality
     found = recovery.found
     table.stage[rows[found]] = Stage.RECOVERED
     table.score[rows[found]], table.output[rows[found]] = recovery.scores[found], outputs

@@ -192,6 +192,7 @@ class LateCascadeFusion:
             mask_mode=config.mask_mode,
             confirm_iou=config.confirm_iou,
             duplicate_iou=config.duplicate_iou,
+            min_quality=config.min_quality,
         )
         return self._trust_recovered(recovery), notes
 

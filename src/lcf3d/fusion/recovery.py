@@ -31,6 +31,7 @@ class Recovery(NamedTuple):
         second_camera: (K,) camera of a pair's second detection, -1 for a single view.
         second_detection: (K,) its index among that camera's detections, or -1.
         second_iou: (K,) image IoU with the second detection, NaN where there is none.
+        quality: (K,) how good the localizer believes its fit to be, NaN where there was no frustum.
     """
 
     camera: IntArray
@@ -43,6 +44,7 @@ class Recovery(NamedTuple):
     second_camera: IntArray
     second_detection: IntArray
     second_iou: FloatArray
+    quality: FloatArray
 
     @property
     def found(self) -> IntArray:
@@ -63,6 +65,7 @@ def recover(
     mask_mode: MaskMode,
     confirm_iou: float,
     duplicate_iou: float,
+    min_quality: float = 0.0,
     pairs: IntArray | None = None,
 ) -> Recovery:
     """Lift 2D detections into frustums, localize, confirm, remove duplicates.
@@ -80,6 +83,7 @@ def recover(
         confirm_iou: ``tau_d``; a box is confirmed when the IoU of its projection and the 2D box is higher, that of a
             pair when both IoUs are at least as high (the two sections of the paper differ in that).
         duplicate_iou: BEV IoU above which two boxes are one object; of two recovered boxes the higher score stays.
+        min_quality: least quality that the localizer gives a box that is confirmed.
         pairs: see `extract_frustums`; the first detection of a pair, the more confident one, is a candidate, the
             second is not.
 
@@ -99,10 +103,12 @@ def recover(
     )
     if not len(proposals):
         return table
-    boxes = _localize(localizer, proposals)
+    boxes, quality = _localize(localizer, proposals)
     # proposals keep the order of the candidates: camera after camera, then detection
     rows = np.searchsorted(_key(table.camera, table.detection), _key(proposals.camera_index, proposals.detection_index))
+    table.quality[rows] = quality
     _confirm(table, rows, proposals, boxes, confirm_iou)
+    table.reason[rows[(table.reason[rows] == Reason.LOCALIZED) & (quality < min_quality)]] = Reason.POOR_FIT
     _mark_duplicates(table, confirmed, duplicate_iou)
     return table
 
@@ -144,6 +150,7 @@ def _candidate_table(
         boxes=np.full((count, 7), np.nan),
         iou=np.full(count, np.nan),
         scores=np.full(count, np.nan),
+        quality=np.full(count, np.nan),
         labels=np.concatenate([np.zeros(0, np.int64), *(d.labels[c] for d, c in zip(detections, chosen, strict=True))]),
         second_camera=np.full(count, -1, dtype=np.int64),
         second_detection=np.full(count, -1, dtype=np.int64),
@@ -155,16 +162,18 @@ def _candidate_table(
     return table
 
 
-def _localize(localizer: Localizer, proposals: FrustumProposals) -> FloatArray:
-    """(K, 7) boxes in the LiDAR frame, NaN where there is none."""
-    boxes, _ = localizer(proposals)
-    if boxes.shape != (len(proposals), 7):
+def _localize(localizer: Localizer, proposals: FrustumProposals) -> tuple[FloatArray, FloatArray]:
+    """(K, 7) boxes in the LiDAR frame, NaN where there is none, and (K,) their qualities."""
+    boxes, quality = localizer(proposals)
+    expected = (len(proposals), 7)
+    if boxes.shape != expected or quality.shape != expected[:1]:
         raise DetectorError(
-            f"localizer {type(localizer).__name__} must return boxes of shape ({len(proposals)}, 7), got {boxes.shape}"
+            f"localizer {type(localizer).__name__} must return boxes of shape {expected} and as many qualities, "
+            f"got {boxes.shape} and {quality.shape}"
         )
     placed = proposals.lidar_from_frustum(boxes)
     placed[~(np.isfinite(placed).all(axis=1) & (placed[:, 3:6] > 0).all(axis=1))] = np.nan
-    return placed
+    return placed, quality
 
 
 def confirmation_iou(

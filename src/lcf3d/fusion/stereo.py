@@ -248,6 +248,7 @@ class StereoLateCascadeFusion(LateCascadeFusion):
             mask_mode=config.mask_mode,
             confirm_iou=config.confirm_iou,
             duplicate_iou=config.duplicate_iou,
+            min_quality=config.min_quality,
             pairs=pairs,
         )
         _note_pairs(branches, recovery)
@@ -287,6 +288,6 @@ def _follow_first_views(table: Decisions) -> None:
     confirming = (table.reason == Reason.OTHER_VIEW) & (table.pair >= 0)
     following = np.flatnonzero((table.reason == Reason.SECOND_VIEW) & (table.pair >= 0))
     first = table.pair[following]
-    for column in (table.stage, table.reason, table.score, table.output):
+    for column in (table.stage, table.reason, table.quality, table.score, table.output):
         column[following] = column[first]
     table.reason[confirming] = Reason.SECOND_VIEW
