@@ -41,7 +41,9 @@ def lidar_detections(frame: Frame, labels: Detections3D, rng: Generator) -> Dete
     counts = points_in_boxes(frame.points, labels.boxes).sum(axis=1)
     found = rng.random(len(labels)) < 1 - np.exp(-counts / POINTS_FOR_DETECTION)
     groups = np.repeat(np.flatnonzero(found), 3)
-    boxes = labels.boxes[groups] + rng.normal(0, [0.15, 0.08, 0.05, 0.15, 0.05, 0.05, 0.06], (len(groups), 7))
+    error = rng.normal(0, [0.15, 0.08, 0.05, 0.15, 0.05, 0.05, 0.06], (len(groups), 7))
+    # small objects are placed more exactly
+    boxes = labels.boxes[groups] + error * np.where(labels.labels[groups] > 0, 0.5, 1.0)[:, None]
     classes = labels.labels[groups].copy()
     confused = (rng.random(len(groups)) < 0.15) & (classes > 0)
     classes[confused] = 3 - classes[confused]
@@ -107,6 +109,7 @@ def main() -> None:
     parser.add_argument("--camera", help="camera detector to run on the images, for example onnx:FILE?tiles=2")
     parser.add_argument("--shared", type=float, default=0.5, help="share of the camera errors that both views have")
     parser.add_argument("--preset", default="kitti")
+    parser.add_argument("--seed", type=int, default=0, help="of the made-up detections")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
 
@@ -126,7 +129,7 @@ def main() -> None:
     data = KittiDataset(options.root, options.split)
     truth = read_folder(data.folder / "label_2", data.ids, results=False)
     results: dict[str, list[Any]] = {name: [] for name in ("lidar", *ways)}
-    rng = np.random.default_rng(0)
+    rng = np.random.default_rng(options.seed)
     for frame_id, objects in zip(data.ids, truth, strict=True):
         frame = data.frame(frame_id)
         labels = frame.labels
