@@ -1,0 +1,60 @@
+import numpy as np
+import pytest
+
+from lcf3d import FusionConfig
+from lcf3d.cli.calibrate import open_study
+from lcf3d.evaluation.ablation import MODULES, AblationInput, ablate, variants
+from lcf3d.fusion.self_calibration import self_calibrate
+from tests.evaluation.drive import write_drive
+
+CONFIG = FusionConfig.preset("kitti")
+
+
+@pytest.fixture(scope="module")
+def rows(tmp_path_factory):
+    root = tmp_path_factory.mktemp("drive")
+    lidar, camera = write_drive(root, 30)
+    study = open_study(f"kitti:{root}", "val", f"results:{lidar}", f"results:{camera}", CONFIG, folds=0, quiet=True)
+    inputs = [AblationInput(*i) for i in zip(study.frames, study.lidar_inputs, study.camera_inputs, strict=True)]
+    return {(row.group, row.name): row for row in ablate(inputs, study.truth, CONFIG, self_calibrate(inputs, CONFIG))}
+
+
+def test_lidar_alone_and_the_filter(rows):
+    alone = rows[MODULES, "none: LiDAR alone"]
+    assert (alone.matched, alone.recovered, alone.kept) == (0, 0, 0)
+    matching = rows[MODULES, "matching"]
+    # three cars a frame match; the two boxes of a class that the camera does not know are kept
+    assert (matching.matched, matching.kept) == (3 * 30, 2 * 30)
+    assert matching.ap["Car"][1] > alone.ap["Car"][1] + 5
+    assert matching.ap["Cyclist"] == pytest.approx(alone.ap["Cyclist"])
+    assert np.isnan(alone.ap["Pedestrian"]).all()
+
+
+def test_policies_differ_in_what_they_keep(rows):
+    kept = {name: row.kept for (group, name), row in rows.items() if group == "unmatched clusters"}
+    assert kept == {"drop": 2 * 30, "downweight": 4 * 30, "keep": 4 * 30}
+
+
+def test_rows_that_need_scans_or_masks_are_left_out_without():
+    def names(**kwargs):
+        return {(v.group, v.name) for v in variants(CONFIG, **kwargs)}
+
+    bare = names(scans=False, masks=True)
+    assert not any("recovery" in name for _, name in bare)
+    assert all((v.changes or {"recovery": False})["recovery"] is False for v in variants(CONFIG, False, False))
+    full = names(scans=True, masks=True)
+    assert {n for g, n in full if g == "instance masks"} == {"box", "mask", "box+mask"}
+    assert (MODULES, "matching + recovery + semantic") in full
+    assert names(scans=True, masks=False) < full
+
+
+def test_every_variant_is_a_valid_setting():
+    for variant in variants(CONFIG, True, True):
+        if variant.changes is not None:
+            CONFIG.updated(**variant.changes)
+
+
+def test_json_has_no_nan(rows):
+    values = rows[MODULES, "none: LiDAR alone"].to_json()
+    assert values["ap"]["Pedestrian"] == [None, None, None]
+    assert values["ap"]["Car"][0] > 0
