@@ -122,8 +122,8 @@ def main() -> None:
     single = LateCascadeFusion(FusionConfig.preset(options.preset))
     ways: dict[str, LateCascadeFusion] = {
         "one view": single,
-        "stereo": StereoLateCascadeFusion(stereo),
-        "stereo, no depth check": StereoLateCascadeFusion(stereo.updated(check_depth=False)),
+        "stereo, unpaired discard": StereoLateCascadeFusion(stereo.updated(unpaired="discard")),
+        "the same without check_depth": StereoLateCascadeFusion(stereo.updated(unpaired="discard", check_depth=False)),
         "stereo, unpaired single_view": StereoLateCascadeFusion(stereo.updated(unpaired="single_view")),
     }
     data = KittiDataset(options.root, options.split)

@@ -59,12 +59,13 @@ def main() -> None:
     options = parser.parse_args()
 
     single = LateCascadeFusion(FusionConfig.preset("kitti"))
+    settings = StereoConfig.preset("kitti")
     ways: dict[str, Any] = {
         "single": single,
-        "stereo": StereoLateCascadeFusion(StereoConfig.preset("kitti")),
-        "stereo, unpaired single_view": StereoLateCascadeFusion(
-            StereoConfig.preset("kitti").updated(unpaired="single_view")
-        ),
+        **{
+            f"stereo, unpaired {unpaired}": StereoLateCascadeFusion(settings.updated(unpaired=unpaired))
+            for unpaired in ("discard", "single_view")
+        },
     }
     times: dict[str, list[float]] = {name: [] for name in ways}
     outputs = dict.fromkeys(ways, 0)

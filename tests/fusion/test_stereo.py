@@ -30,7 +30,7 @@ NEAR, WALKER = car(12, 2), pedestrian(15, -4)
 
 
 def fuse(found3d, found2d, points=None, objects=(), views=None, localizer=None, **settings):
-    settings = {"unmatched": "drop", "ensemble": "probabilistic", **settings}
+    settings = {"unmatched": "drop", "ensemble": "probabilistic", "unpaired": "discard", **settings}
     fusion = StereoLateCascadeFusion(
         StereoConfig().updated(**settings), localizer or TrueLocalizer(list(objects) or [NEAR])
     )
@@ -331,7 +331,9 @@ def test_settings_survive_a_file(name, tmp_path):
     config.dump(tmp_path / "c.yaml")
     assert StereoConfig.load(str(tmp_path / "c.yaml")) == config
     assert StereoConfig.load(name) == config
-    assert (config.match_iou, config.check_depth) == (0.5, name != "paper")
+    assert config.match_iou == 0.5
+    paper = (False, "discard")
+    assert (config.check_depth, config.unpaired) == (paper if name == "paper" else (True, "single_view"))
 
 
 def test_senseless_settings():

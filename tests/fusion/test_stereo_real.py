@@ -30,7 +30,7 @@ def scene(shared):
 
 def test_three_cars_are_seen_by_all_and_one_is_recovered(scene):
     frame, cars, found = scene
-    fused = StereoLateCascadeFusion(StereoConfig())(frame, cars, found)
+    fused = StereoLateCascadeFusion(StereoConfig(unpaired="discard"))(frame, cars, found)
     in_both = (fused.lidar.stage == Stage.MATCHED) & (fused.lidar.pair >= 0)
     assert in_both.sum() == 3
     recovered = np.flatnonzero(fused.stages == Stage.RECOVERED)
@@ -46,7 +46,7 @@ def test_three_cars_are_seen_by_all_and_one_is_recovered(scene):
 
 def test_camera_alone_recovers_four_cars_in_pairs(scene):
     frame, _, found = scene
-    fused = StereoLateCascadeFusion(StereoConfig())(frame, Detections3D.empty(KITTI_CLASSES), found)
+    fused = StereoLateCascadeFusion(StereoConfig(unpaired="discard"))(frame, Detections3D.empty(KITTI_CLASSES), found)
     assert fused.stages.tolist() == [Stage.RECOVERED] * 4
     assert (iou_3d(fused.detections.boxes, frame.labels.boxes).max(axis=1) > 0.5).all()
     left = np.flatnonzero((fused.camera.camera == 0) & (fused.camera.output >= 0))

@@ -37,7 +37,8 @@ class StereoConfig(FusionConfig):
         default=True, description="views pair only where disparity and height in the image give a believable size"
     )
     unpaired: Literal["discard", "single_view"] = Field(
-        default="discard", description="2D detections that only one view of a pair has: drop, or recover from that view"
+        default="single_view",
+        description="2D detections that only one view of a pair has: drop, or recover from that view",
     )
 
     @model_validator(mode="after")
@@ -49,13 +50,15 @@ class StereoConfig(FusionConfig):
 
     @classmethod
     def preset(cls, name: str) -> StereoConfig:
-        """The settings of `FusionConfig.preset` with the stereo values; ``paper`` leaves ``check_depth`` out.
+        """The settings of `FusionConfig.preset` with the stereo values; ``paper`` discards and checks no depth.
 
         Raises:
             ConfigError: there is no such preset.
         """
         FusionConfig.preset(name)
-        values: dict[str, Any] = {**PRESETS[name], "match_iou": 0.5, "check_depth": name != "paper"}
+        values: dict[str, Any] = {**PRESETS[name], "match_iou": 0.5}
+        if name == "paper":
+            values.update(check_depth=False, unpaired="discard")
         return cls(**values)
 
 
