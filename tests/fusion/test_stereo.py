@@ -325,6 +325,13 @@ def test_recovered_boxes_are_trusted_as_much_as_with_one_view():
     assert stereo.detections.scores == pytest.approx(single.detections.scores)
 
 
+def test_a_camera_that_the_frame_lacks_is_not_calibrated():
+    with pytest.raises(Lcf3dError, match="needs both cameras calibrated"):
+        fuse(lidar([], []), {"left": none2d()}, views=[camera("left")])
+    # a pair of which there is nothing at all is no business of this frame
+    assert len(fuse(lidar([], []), {"front": none2d()}, views=[camera("front")])) == 0
+
+
 @pytest.mark.parametrize("name", ["paper", "kitti", "nuscenes"])
 def test_settings_survive_a_file(name, tmp_path):
     config = StereoConfig.preset(name)

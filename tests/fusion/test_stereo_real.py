@@ -57,8 +57,9 @@ def test_camera_alone_recovers_four_cars_in_pairs(scene):
     assert (np.diag(epipolar_costs(own, other, lines)) / 2 < 5).all()
 
 
-def test_exchanged_images_are_refused(scene):
+@pytest.mark.parametrize("threshold", [0.1, 0.5])
+def test_exchanged_images_are_refused(scene, threshold):
     frame, cars, found = scene
     exchanged = {"left": found["right"], "right": found["left"]}
     with pytest.raises(Lcf3dError, match="with the views exchanged"):
-        StereoLateCascadeFusion(StereoConfig(camera_score_threshold=0.3))(frame, cars, exchanged)
+        StereoLateCascadeFusion(StereoConfig(camera_score_threshold=threshold))(frame, cars, exchanged)

@@ -105,8 +105,8 @@ class StereoLateCascadeFusion(LateCascadeFusion):
         known = {view.name for view in frame.cameras}
         notes = []
         for left, right in self.config.pairs:
-            absent = [name for name in (left, right) if name in camera and name not in known]
-            if absent:
+            absent = [name for name in (left, right) if name not in known]
+            if len(absent) == 1:
                 raise ConfigError(
                     f"frame {frame.id}: stereo pair {left}/{right} needs both cameras calibrated, but there is no "
                     f"calibration of {absent[0]!r}, only of {sorted(known)}; add it or run with one camera"

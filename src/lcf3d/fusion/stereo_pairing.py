@@ -23,6 +23,8 @@ BELIEVABLE_HEIGHTS = (0.5, 4.5)
 BORDER = 2.0
 # pairs that must speak for exchanged views, and none against, before they are called so
 EXCHANGED_PAIRS = 3
+# detections of lower score have no say in that: among many false ones some pair by chance
+CONFIDENT = 0.5
 
 
 def check_stereo_pair(left: Camera, right: Camera) -> None:
@@ -164,13 +166,14 @@ def check_not_exchanged(
 ) -> None:
     """Refuse detections that fit the cameras only with the two views exchanged, or are one view's twice.
 
-    A gate of a third is taken, so that only what fits well speaks; it never did so on frames in order
-    (benchmarks/stereo_pairing.py).
+    Only `CONFIDENT` detections and a third of the gate are taken, so that only what fits well speaks; on frames in
+    order it never did (benchmarks/stereo_pairing.py).
 
     Raises:
         ConfigError: both views have the same boxes; or there are no pairs, but `EXCHANGED_PAIRS` or more when the views
             are exchanged.
     """
+    left_found, right_found = left_found[left_found.scores > CONFIDENT], right_found[right_found.scores > CONFIDENT]
     if min(len(left_found), len(right_found)) < EXCHANGED_PAIRS:
         return
     if np.array_equal(left_found.boxes, right_found.boxes):
