@@ -23,7 +23,9 @@ def simulate(
     ] = None,
     density: Annotated[float, typer.Option(help="Factor on the number of road users.")] = 1.0,
     jobs: Annotated[int, typer.Option(help="Processes.")] = 1,
-    resume: Annotated[bool, typer.Option("--resume", help="Complete a data set whose simulation was interrupted.")] = False,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Complete a data set whose simulation was interrupted.")
+    ] = False,
 ) -> None:
     """Simulate LiDAR scans and camera images of street scenes, with exact labels.
 

@@ -9,39 +9,86 @@ from typing import Final
 
 import numpy as np
 
-from lcf3d.simulation.meshes import people, vehicles
-from lcf3d.simulation.meshes.cars import SHAPES, build_car
+from lcf3d.simulation.meshes import people, two_wheelers, vehicles
+from lcf3d.simulation.meshes.car_shapes import SHAPES
+from lcf3d.simulation.meshes.cars import build_car
 from lcf3d.simulation.meshes.primitives import Mesh
-from lcf3d.simulation.roads import Path, Terrain
+from lcf3d.simulation.roads import Path
 from lcf3d.simulation.sizes import draw_size
 
 Colour = tuple[float, float, float]
 
 CAR_COLOURS: Final[tuple[tuple[float, Colour], ...]] = (
-    (0.17, (0.72, 0.72, 0.70)), (0.22, (0.36, 0.37, 0.38)), (0.13, (0.13, 0.135, 0.14)), (0.19, (0.012, 0.012, 0.014)),
-    (0.10, (0.02, 0.045, 0.16)), (0.07, (0.36, 0.015, 0.015)), (0.03, (0.03, 0.12, 0.06)), (0.03, (0.45, 0.33, 0.20)),
-    (0.02, (0.60, 0.38, 0.02)), (0.04, (0.10, 0.20, 0.34)),
+    (0.17, (0.72, 0.72, 0.70)),
+    (0.22, (0.36, 0.37, 0.38)),
+    (0.13, (0.13, 0.135, 0.14)),
+    (0.19, (0.012, 0.012, 0.014)),
+    (0.10, (0.02, 0.045, 0.16)),
+    (0.07, (0.36, 0.015, 0.015)),
+    (0.03, (0.03, 0.12, 0.06)),
+    (0.03, (0.45, 0.33, 0.20)),
+    (0.02, (0.60, 0.38, 0.02)),
+    (0.04, (0.10, 0.20, 0.34)),
 )
 """Share and linear RGB of car colours."""
 
 KINDS: Final[tuple[str, ...]] = (
-    "car", "van", "truck", "bus", "tram", "trailer", "construction_vehicle", "pedestrian", "sitting", "cyclist", "bicycle",
-    "motorcyclist", "motorcycle", "cone", "barrier", "cart",
+    "car",
+    "van",
+    "truck",
+    "bus",
+    "tram",
+    "trailer",
+    "construction_vehicle",
+    "pedestrian",
+    "sitting",
+    "cyclist",
+    "bicycle",
+    "motorcyclist",
+    "motorcycle",
+    "cone",
+    "barrier",
+    "cart",
 )
 """What can be put on a street."""
 
 KITTI_CLASS: Final[dict[str, str | None]] = {
-    "car": "Car", "van": "Van", "truck": "Truck", "bus": "Truck", "tram": "Tram", "trailer": "Misc",
-    "construction_vehicle": "Misc", "pedestrian": "Pedestrian", "sitting": "Person_sitting", "cyclist": "Cyclist",
-    "bicycle": None, "motorcyclist": "Cyclist", "motorcycle": None, "cone": None, "barrier": None, "cart": "Misc",
+    "car": "Car",
+    "van": "Van",
+    "truck": "Truck",
+    "bus": "Truck",
+    "tram": "Tram",
+    "trailer": "Misc",
+    "construction_vehicle": "Misc",
+    "pedestrian": "Pedestrian",
+    "sitting": "Person_sitting",
+    "cyclist": "Cyclist",
+    "bicycle": None,
+    "motorcyclist": "Cyclist",
+    "motorcycle": None,
+    "cone": None,
+    "barrier": None,
+    "cart": "Misc",
 }
 """KITTI class of every kind; None is not annotated."""
 
 NUSCENES_CLASS: Final[dict[str, str]] = {
-    "car": "car", "van": "car", "truck": "truck", "bus": "bus", "tram": "bus", "trailer": "trailer",
-    "construction_vehicle": "construction_vehicle", "pedestrian": "pedestrian", "sitting": "pedestrian",
-    "cyclist": "bicycle", "bicycle": "bicycle", "motorcyclist": "motorcycle", "motorcycle": "motorcycle",
-    "cone": "traffic_cone", "barrier": "barrier", "cart": "trailer",
+    "car": "car",
+    "van": "car",
+    "truck": "truck",
+    "bus": "bus",
+    "tram": "bus",
+    "trailer": "trailer",
+    "construction_vehicle": "construction_vehicle",
+    "pedestrian": "pedestrian",
+    "sitting": "pedestrian",
+    "cyclist": "bicycle",
+    "bicycle": "bicycle",
+    "motorcyclist": "motorcycle",
+    "motorcycle": "motorcycle",
+    "cone": "traffic_cone",
+    "barrier": "barrier",
+    "cart": "trailer",
 }
 """nuScenes detection class of every kind."""
 
@@ -98,16 +145,16 @@ class Actor:
     animated: bool = False
     stopped: bool = False
 
-    def box(self, time: float, terrain: Terrain) -> tuple[float, float, float, float, float, float, float]:
-        """World box (x, y, z of the geometric centre, length, width, height, yaw)."""
+    def box(self, time: float, ground: float) -> tuple[float, float, float, float, float, float, float]:
+        """World box (x, y, z of the geometric centre, length, width, height, yaw), standing at height ``ground``."""
         x, y, yaw = self.motion.pose(time)
         length, width, height = self.size
-        return x, y, float(terrain.height(x, y)) + height / 2, length, width, height, yaw
+        return x, y, ground + height / 2, length, width, height, yaw
 
-    def mesh(self, time: float, terrain: Terrain) -> Mesh:
-        """Mesh in the world."""
+    def mesh(self, time: float, ground: float) -> Mesh:
+        """Mesh in the world, standing at height ``ground``."""
         x, y, yaw = self.motion.pose(time)
-        return self.mesh_at(time).placed(x, y, float(terrain.height(x, y)), yaw)
+        return self.mesh_at(time).placed(x, y, ground, yaw)
 
 
 def _colour(rng: np.random.Generator) -> Colour:
@@ -125,7 +172,11 @@ def _car_template(shape: str, fine: bool) -> Mesh:
 @lru_cache(maxsize=8)
 def _large_template(kind: str, variant: int) -> Mesh:
     if kind == "truck":
-        load, colour = (("container", (0.62, 0.62, 0.60)), ("tarpaulin", (0.05, 0.14, 0.34)), ("tarpaulin", (0.5, 0.06, 0.04)))[variant]
+        load, colour = (
+            ("container", (0.62, 0.62, 0.60)),
+            ("tarpaulin", (0.05, 0.14, 0.34)),
+            ("tarpaulin", (0.5, 0.06, 0.04)),
+        )[variant]
         return vehicles.truck(8.6, 2.5, 3.4, load, colour)
     if kind == "bus":
         return vehicles.bus(10.6, 2.6, 3.2)
@@ -139,7 +190,9 @@ def _large_template(kind: str, variant: int) -> Mesh:
 def _vehicle_mesh(kind: str, size: tuple[float, float, float], fine: bool, rng: np.random.Generator) -> Mesh:
     """A vehicle of the size: the template nearest in proportions, stretched to fit and painted."""
     if kind in ("truck", "bus", "tram", "trailer", "construction_vehicle"):
-        template = _large_template(kind, int(rng.integers(2 if kind == "tram" else 3 if kind in ("truck", "trailer") else 1)))
+        template = _large_template(
+            kind, int(rng.integers(2 if kind == "tram" else 3 if kind in ("truck", "trailer") else 1))
+        )
     else:
         names = ("van", "bus_van") if kind == "van" else ("hatchback", "small", "saloon", "estate", "suv", "minivan")
         ratios = np.array([size[2] / size[0] - SHAPES[n].size[2] / SHAPES[n].size[0] for n in names])
@@ -160,7 +213,7 @@ def _person_template(kind: str, style: int, phase: int, stride: float) -> Mesh:
     angle = 2 * np.pi * phase / _PHASES
     if kind == "pedestrian":
         return people.pedestrian(clothes, angle, stride)
-    return people.cyclist(clothes, people.BIKE_SLOT, angle, float(rng.uniform(0.2, 0.7)))
+    return two_wheelers.cyclist(clothes, two_wheelers.BIKE_SLOT, angle, float(rng.uniform(0.2, 0.7)))
 
 
 @lru_cache(maxsize=256)
@@ -171,7 +224,9 @@ def _person_bounds(kind: str, style: int, stride: float) -> tuple[tuple[float, .
     return tuple(low.tolist()), tuple(high.tolist())
 
 
-def _person_mesh(kind: str, size: tuple[float, float, float], speed: float, rng: np.random.Generator) -> Callable[[float], Mesh]:
+def _person_mesh(
+    kind: str, size: tuple[float, float, float], speed: float, rng: np.random.Generator
+) -> Callable[[float], Mesh]:
     """Mesh over time of a person (on foot or riding), with the same stretch at every step."""
     style, phase = int(rng.integers(_STYLES)), int(rng.integers(_PHASES))
     palette = [*people.random_palette(rng), _colour(rng)]
@@ -194,12 +249,20 @@ def _person_mesh(kind: str, size: tuple[float, float, float], speed: float, rng:
     return mesh_at
 
 
-def make_actor(id: int, kind: str, motion: Motion, rng: np.random.Generator, dataset: str = "kitti",
-               size: tuple[float, float, float] | None = None, stopped: bool = False, fine: bool = True) -> Actor:
+def make_actor(
+    id: int,
+    kind: str,
+    motion: Motion,
+    rng: np.random.Generator,
+    dataset: str = "kitti",
+    size: tuple[float, float, float] | None = None,
+    stopped: bool = False,
+    fine: bool = True,
+) -> Actor:
     """A road user of a kind, with size, shape and colours drawn at random.
 
-    ``dataset`` (``kitti`` or ``nuscenes``) names the statistics its size is drawn from; ``fine`` False makes cars coarser, for those
-    that stay far away.
+    ``dataset`` (``kitti`` or ``nuscenes``) names the statistics its size is drawn from; ``fine`` False makes
+    cars coarser, for those that stay far away.
     """
     if size is None:
         size = actor_size(kind, dataset, rng)
@@ -214,11 +277,11 @@ def _still_mesh(kind: str, size: tuple[float, float, float], fine: bool, rng: np
     if kind == "sitting":
         return people.sitting_person(people.random_style(rng)).fitted(*size)
     if kind == "bicycle":
-        return people.bicycle(_colour(rng)).fitted(*size)
+        return two_wheelers.bicycle(_colour(rng)).fitted(*size)
     if kind == "motorcycle":
-        return people.motorcycle(_colour(rng)).fitted(*size)
+        return two_wheelers.motorcycle(_colour(rng)).fitted(*size)
     if kind == "motorcyclist":
-        return people.motorcyclist(people.random_style(rng), _colour(rng)).fitted(*size)
+        return two_wheelers.motorcyclist(people.random_style(rng), _colour(rng)).fitted(*size)
     if kind == "cone":
         return vehicles.traffic_cone().fitted(*size)
     if kind == "barrier":
@@ -230,9 +293,19 @@ def _still_mesh(kind: str, size: tuple[float, float, float], fine: bool, rng: np
 
 def actor_size(kind: str, dataset: str, rng: np.random.Generator) -> tuple[float, float, float]:
     """Size by kind, from the class of the dataset it is labelled as where that has a size of its own."""
-    special = {"cyclist": "Cyclist", "van": "Van", "tram": "Tram", "sitting": "Person_sitting", "bus": "bus", "motorcycle": "motorcycle",
-               "bicycle": "bicycle", "trailer": "trailer", "construction_vehicle": "construction_vehicle", "cone": "traffic_cone",
-               "barrier": "barrier"}
+    special = {
+        "cyclist": "Cyclist",
+        "van": "Van",
+        "tram": "Tram",
+        "sitting": "Person_sitting",
+        "bus": "bus",
+        "motorcycle": "motorcycle",
+        "bicycle": "bicycle",
+        "trailer": "trailer",
+        "construction_vehicle": "construction_vehicle",
+        "cone": "traffic_cone",
+        "barrier": "barrier",
+    }
     if kind == "motorcyclist":
         length, width, _ = draw_size("motorcycle", rng)
         return length, width, round(float(rng.uniform(1.55, 1.8)), 2)

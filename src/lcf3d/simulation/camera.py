@@ -58,10 +58,13 @@ class Stage:
     world_from_lidar: NDArray[np.float64]
 
 
-def camera_rays(camera: Camera, world_from_lidar: NDArray[np.float64], u: NDArray[np.floating], v: NDArray[np.floating]) -> tuple[NDArray[np.float64], Floats]:
+def camera_rays(
+    camera: Camera, world_from_lidar: NDArray[np.float64], u: NDArray[np.floating], v: NDArray[np.floating]
+) -> tuple[NDArray[np.float64], Floats]:
     """World position (3,) of the camera and unit directions (N, 3) through pixel positions (u, v).
 
-    A point that projects to (u, v) belongs to pixel (floor(u), floor(v)), so the centre of pixel (i, j) is (i + 0.5, j + 0.5).
+    A point that projects to (u, v) belongs to pixel (floor(u), floor(v)); pixel (i, j) has its centre at
+    (i + 0.5, j + 0.5).
     """
     inverse = np.linalg.inv(camera.intrinsics)
     centre = -inverse @ camera.projection[:, 3]
@@ -77,10 +80,15 @@ def camera_rays(camera: Camera, world_from_lidar: NDArray[np.float64], u: NDArra
 
 def measure_exposure(camera: Camera, stage: Stage) -> float:
     """Exposure that brings the lower two thirds of the picture to a middle grey, from a coarse raster of rays."""
-    u, v = np.meshgrid(np.linspace(2, camera.width - 2, 64, dtype=np.float32), np.linspace(camera.height / 3, camera.height - 2, 24, dtype=np.float32))
+    u, v = np.meshgrid(
+        np.linspace(2, camera.width - 2, 64, dtype=np.float32),
+        np.linspace(camera.height / 3, camera.height - 2, 24, dtype=np.float32),
+    )
     origin, direction = camera_rays(camera, stage.world_from_lidar, u.ravel(), v.ravel())
     hits = stage.tracer.first_hits(origin, direction)
-    radiance, _ = _radiance(stage, hits, direction, origin, _forward(camera, stage), np.ones(u.size, np.float32), camera)
+    radiance, _ = _radiance(
+        stage, hits, direction, origin, _forward(camera, stage), np.ones(u.size, np.float32), camera
+    )
     mean = float(np.exp(np.log(np.maximum(radiance.mean(axis=1), 1e-4)).mean()))
     return float(np.clip(0.15 / mean, 0.35, 6.0 if stage.light.night > 0 else 2.5))
 
@@ -105,20 +113,37 @@ def render(camera: Camera, stage: Stage, rng: np.random.Generator, exposure: flo
     cosine = direction @ forward.astype(np.float32)
     depth = np.where(hit, hits.distance * cosine, np.inf).astype(np.float32)
     owner = np.where(hit, stage.owner[hits.triangle], 0).astype(np.int32)
-    edge = np.flatnonzero(find_edges(hits.triangle.reshape(height, width), stage.mesh.material, owner.reshape(height, width),
-                                     normal.reshape(height, width, 3), depth.reshape(height, width)))
+    edge = np.flatnonzero(
+        find_edges(
+            hits.triangle.reshape(height, width),
+            stage.mesh.material,
+            owner.reshape(height, width),
+            normal.reshape(height, width, 3),
+            depth.reshape(height, width),
+        )
+    )
     if len(edge):
         radiance[edge] = _smooth(stage, camera, u, v, edge, opened, forward, radiance[edge])
     image = develop(radiance.reshape(height, width, 3), rng, exposure, stage.light.night > 0)
     return Render(image, owner.reshape(height, width), depth.reshape(height, width))
 
 
-def _smooth(stage: Stage, camera: Camera, u: Floats, v: Floats, edge: NDArray[np.int64], opened: Floats, forward: NDArray[np.float64],
-            centre: Floats) -> Floats:
+def _smooth(
+    stage: Stage,
+    camera: Camera,
+    u: Floats,
+    v: Floats,
+    edge: NDArray[np.int64],
+    opened: Floats,
+    forward: NDArray[np.float64],
+    centre: Floats,
+) -> Floats:
     """Radiance of the pixels at edges, averaged over two more rays each."""
     total = centre.copy()
     for du, dv in _EDGE_OFFSETS:
-        origin, direction = camera_rays(camera, stage.world_from_lidar, u[edge] + np.float32(du), v[edge] + np.float32(dv))
+        origin, direction = camera_rays(
+            camera, stage.world_from_lidar, u[edge] + np.float32(du), v[edge] + np.float32(dv)
+        )
         hits = stage.tracer.first_hits(origin, direction)
         extra, _ = _radiance(stage, hits, direction, origin, forward, opened[edge], camera)
         total += np.minimum(extra, 4.0)
@@ -130,23 +155,61 @@ def _material_table() -> Floats:
     return camera_table(texture_ids())
 
 
-def _radiance(stage: Stage, hits: Hits, direction: Floats, origin: NDArray[np.float64], forward: NDArray[np.float64], opened: Floats,
-              camera: Camera) -> tuple[Floats, Floats]:
+def _radiance(
+    stage: Stage,
+    hits: Hits,
+    direction: Floats,
+    origin: NDArray[np.float64],
+    forward: NDArray[np.float64],
+    opened: Floats,
+    camera: Camera,
+) -> tuple[Floats, Floats]:
     """(N, 3) linear radiance and (N, 3) normals of rays."""
     n, mesh, light = len(direction), stage.mesh, stage.light
     position, normal = np.zeros((n, 3), np.float32), np.zeros((n, 3), np.float32)
     facing = np.zeros(n, dtype=np.bool_)
     start = origin.astype(np.float32)
-    locate(hits.triangle, hits.u, hits.v, hits.distance, direction, start, mesh.corners, mesh.normals, light.sun.astype(np.float32),
-           position, normal, facing)
+    locate(
+        hits.triangle,
+        hits.u,
+        hits.v,
+        hits.distance,
+        direction,
+        start,
+        mesh.corners,
+        mesh.normals,
+        light.sun.astype(np.float32),
+        position,
+        normal,
+        facing,
+    )
     lit = np.zeros(n, dtype=np.float32)
     which = np.flatnonzero(facing)
     if light.sun_colour.max() > 0.005:
         lit[which] = ~stage.tracer.is_blocked(position[which], np.broadcast_to(light.sun, (len(which), 3)))
     out = np.empty((n, 3), dtype=np.float32)
-    shade(hits.triangle, hits.u, hits.v, hits.distance, direction, position, normal, lit, opened, mesh.uv, mesh.material, mesh.colour,
-          mesh.seed, _material_table(), texture_pyramids(), stage.road, light.sky, light.numbers(origin, forward),
-          np.float32(1 / camera.intrinsics[0, 0]), out)
+    shade(
+        hits.triangle,
+        hits.u,
+        hits.v,
+        hits.distance,
+        direction,
+        position,
+        normal,
+        lit,
+        opened,
+        mesh.uv,
+        mesh.material,
+        mesh.colour,
+        mesh.seed,
+        _material_table(),
+        texture_pyramids(),
+        stage.road,
+        light.sky,
+        light.numbers(origin, forward),
+        np.float32(1 / camera.intrinsics[0, 0]),
+        out,
+    )
     return out, normal
 
 
@@ -157,19 +220,34 @@ def _open_directions() -> Floats:
     radius, angle = np.sqrt((k + 0.5) / 16), k * 2.399963
     order = np.array([0, 8, 2, 10, 12, 4, 14, 6, 3, 11, 1, 9, 15, 7, 13, 5])
     result = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.sqrt(1 - radius**2)], axis=1)
-    return result[order].astype(np.float32)
+    ordered: Floats = result[order].astype(np.float32)
+    return ordered
 
 
-def _openness(stage: Stage, hits: Hits, direction: Floats, origin: NDArray[np.float64], width: int, height: int) -> Floats:
-    """(N,) share of near surroundings that is open, from one short ray for every fourth pixel, smoothed within surfaces."""
+def _openness(
+    stage: Stage, hits: Hits, direction: Floats, origin: NDArray[np.float64], width: int, height: int
+) -> Floats:
+    """(N,) open share of the near surroundings, from a short ray for every fourth pixel, smoothed within surfaces."""
     rows, columns = np.arange(0, height, 2), np.arange(0, width, 2)
     pick = (rows[:, None] * width + columns[None, :]).ravel()
     triangle = hits.triangle[pick]
     n = len(pick)
     position, normal = np.zeros((n, 3), np.float32), np.zeros((n, 3), np.float32)
     facing = np.zeros(n, dtype=np.bool_)
-    locate(triangle, hits.u[pick], hits.v[pick], hits.distance[pick], direction[pick], origin.astype(np.float32), stage.mesh.corners,
-           stage.mesh.normals, np.zeros(3, np.float32), position, normal, facing)
+    locate(
+        triangle,
+        hits.u[pick],
+        hits.v[pick],
+        hits.distance[pick],
+        direction[pick],
+        origin.astype(np.float32),
+        stage.mesh.corners,
+        stage.mesh.normals,
+        np.zeros(3, np.float32),
+        position,
+        normal,
+        facing,
+    )
     tile = ((rows[:, None] // 2 % 4) * 4 + columns[None, :] // 2 % 4).ravel()
     local = _open_directions()[tile]
     which = np.flatnonzero((triangle >= 0) & (hits.distance[pick] < 80))
@@ -192,7 +270,8 @@ def _around(normal: Floats, local: Floats) -> Floats:
     b = nx * ny * a
     first = np.stack([1 + sign * nx * nx * a, sign * b, -sign * nx], axis=1)
     second = np.stack([b, sign + ny * ny * a, -ny], axis=1)
-    return local[:, :1] * first + local[:, 1:2] * second + local[:, 2:] * normal
+    result: Floats = local[:, :1] * first + local[:, 1:2] * second + local[:, 2:] * normal
+    return result
 
 
 @njit(cache=True, nogil=True)
@@ -207,7 +286,11 @@ def spread_openness(blocked, distance, normal, full, out):  # type: ignore[no-un
             for a in range(max(i - 4, 0), min(i + 4, h)):
                 for b in range(max(j - 4, 0), min(j + 4, w)):
                     if abs(distance[a, b] - d) < 0.06 * d:
-                        same = normal[a, b, 0] * normal[i, j, 0] + normal[a, b, 1] * normal[i, j, 1] + normal[a, b, 2] * normal[i, j, 2]
+                        same = (
+                            normal[a, b, 0] * normal[i, j, 0]
+                            + normal[a, b, 1] * normal[i, j, 1]
+                            + normal[a, b, 2] * normal[i, j, 2]
+                        )
                         if same > 0.7:
                             total += blocked[a, b]
                             weight += 1.0
@@ -237,7 +320,11 @@ def find_edges(triangle, material, owner, normal, depth):  # type: ignore[no-unt
                 if p < 0 or q < 0 or owner[i, j] != owner[a, b] or material[p] != material[q]:
                     edge[i, j] = edge[a, b] = True
                     continue
-                same = normal[i, j, 0] * normal[a, b, 0] + normal[i, j, 1] * normal[a, b, 1] + normal[i, j, 2] * normal[a, b, 2]
+                same = (
+                    normal[i, j, 0] * normal[a, b, 0]
+                    + normal[i, j, 1] * normal[a, b, 1]
+                    + normal[i, j, 2] * normal[a, b, 2]
+                )
                 if same < 0.85 or abs(depth[i, j] - depth[a, b]) > 0.05 * min(depth[i, j], depth[a, b]):
                     edge[i, j] = edge[a, b] = True
     return edge
@@ -249,14 +336,21 @@ def develop(radiance: Floats, rng: np.random.Generator, exposure: float, night: 
     grey = x.mean(axis=2, keepdims=True)
     x = np.maximum(grey + (x - grey) * np.float32(1.12), 0)
     noise = rng.standard_normal(x.shape, dtype=np.float32)
-    x = np.maximum(x + noise * (np.float32(0.004) + np.float32(0.012) * np.sqrt(np.maximum(x, 0))) * np.float32(2.0 if night else 1.0), 0)
+    x = np.maximum(
+        x
+        + noise
+        * (np.float32(0.004) + np.float32(0.012) * np.sqrt(np.maximum(x, 0)))
+        * np.float32(2.0 if night else 1.0),
+        0,
+    )
     return film(x)
 
 
 def film(x: Floats) -> NDArray[np.uint8]:
     """uint8 sRGB of exposed linear values through a filmic curve (fit of Narkowicz 2015) by table."""
     index = np.minimum(np.sqrt(x * np.float32(0.125)) * np.float32(4096), np.float32(4095)).astype(np.int32)
-    return _film_table()[index]
+    image: NDArray[np.uint8] = _film_table()[index]
+    return image
 
 
 @lru_cache(maxsize=1)

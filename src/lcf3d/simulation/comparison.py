@@ -63,14 +63,18 @@ class LabelStatistics:
     occlusion: dict[str, FloatArray]
 
 
-def scan_statistics(root: Path, ids: Sequence[str] | None = None, classes: Sequence[str] = ("Car", "Pedestrian", "Cyclist")) -> ScanStatistics:
+def scan_statistics(
+    root: Path, ids: Sequence[str] | None = None, classes: Sequence[str] = ("Car", "Pedestrian", "Cyclist")
+) -> ScanStatistics:
     """Statistics of the scans of a KITTI-layout folder; objects need labels beside the scans.
 
     Raises:
         DatasetError: there is no scan.
     """
     dataset = KittiDataset(root)
-    found = [i for i in (ids if ids is not None else dataset.ids) if (dataset.folder / "velodyne" / f"{i}.bin").exists()]
+    found = [
+        i for i in (ids if ids is not None else dataset.ids) if (dataset.folder / "velodyne" / f"{i}.bin").exists()
+    ]
     if not found:
         raise DatasetError(f"{root} holds no scans")
     counts, ranges, intensities, beams = [], [], [], []
@@ -86,14 +90,20 @@ def scan_statistics(root: Path, ids: Sequence[str] | None = None, classes: Seque
         if (dataset.folder / "label_2" / f"{frame_id}.txt").exists():
             _count_points(dataset, frame_id, points, objects)
     gathered = {name: np.array(rows).reshape(-1, 2) for name, rows in objects.items()}
-    return ScanStatistics(np.array(counts), np.array(ranges), np.array(intensities), np.array(beams, dtype=np.float64), gathered)
+    return ScanStatistics(
+        np.array(counts), np.array(ranges), np.array(intensities), np.array(beams, dtype=np.float64), gathered
+    )
 
 
-def _count_points(dataset: KittiDataset, frame_id: str, points: NDArray[np.float32], objects: dict[str, list[FloatArray]]) -> None:
+def _count_points(
+    dataset: KittiDataset, frame_id: str, points: NDArray[np.float32], objects: dict[str, list[FloatArray]]
+) -> None:
     """Add distance and points of every unoccluded, untruncated object of a frame."""
     labels = read_folder(dataset.folder / "label_2", [frame_id], results=False)[0]
     clear = (labels.occluded == 0) & (labels.truncated < 0.05)
-    boxes = lidar_from_kitti(labels.locations, labels.dimensions, labels.rotation_y, dataset.calibration(frame_id).camera_from_lidar)
+    boxes = lidar_from_kitti(
+        labels.locations, labels.dimensions, labels.rotation_y, dataset.calibration(frame_id).camera_from_lidar
+    )
     for name, rows in objects.items():
         chosen = boxes[clear & (labels.class_names == name)]
         if len(chosen):
@@ -106,8 +116,21 @@ def label_statistics(root: Path, ids: Sequence[str] | None = None) -> LabelStati
     folder = root / "training" / "label_2"
     chosen = list(ids) if ids is not None else sorted(p.stem for p in folder.glob("*.txt"))
     frames = [read_folder(folder, [i], results=False)[0] for i in chosen]
-    every = KittiObjects(*(np.concatenate([getattr(f, n) for f in frames]) for n in (
-        "class_names", "truncated", "occluded", "alpha", "boxes2d", "dimensions", "locations", "rotation_y")))
+    every = KittiObjects(
+        *(
+            np.concatenate([getattr(f, n) for f in frames])
+            for n in (
+                "class_names",
+                "truncated",
+                "occluded",
+                "alpha",
+                "boxes2d",
+                "dimensions",
+                "locations",
+                "rotation_y",
+            )
+        )
+    )
     names = sorted(set(every.class_names.tolist()))
     count = max(1, len(frames))
     with_class = {n: float(np.mean([np.any(f.class_names == n) for f in frames])) for n in names}
@@ -126,34 +149,57 @@ def label_statistics(root: Path, ids: Sequence[str] | None = None) -> LabelStati
 def median_points(objects: FloatArray) -> FloatArray:
     """(len(DISTANCE_EDGES) - 1,) median points per object in each distance class, NaN where there are fewer than 2."""
     which = np.digitize(objects[:, 0], DISTANCE_EDGES) - 1
-    result = [np.median(objects[which == k, 1]) if (which == k).sum() >= 2 else np.nan for k in range(len(DISTANCE_EDGES) - 1)]
+    result = [
+        np.median(objects[which == k, 1]) if (which == k).sum() >= 2 else np.nan for k in range(len(DISTANCE_EDGES) - 1)
+    ]
     return np.array(result)
 
 
-def summary(real: ScanStatistics, simulated: ScanStatistics, real_labels: LabelStatistics, simulated_labels: LabelStatistics) -> dict[str, Any]:
+def summary(
+    real: ScanStatistics, simulated: ScanStatistics, real_labels: LabelStatistics, simulated_labels: LabelStatistics
+) -> dict[str, Any]:
     """The comparison as numbers, for JSON."""
 
     def scans(s: ScanStatistics) -> dict[str, Any]:
         return {
             "scans": len(s.counts),
-            "points_mean": float(s.counts.mean()), "points_min": int(s.counts.min()), "points_max": int(s.counts.max()),
+            "points_mean": float(s.counts.mean()),
+            "points_min": int(s.counts.min()),
+            "points_max": int(s.counts.max()),
             "range_edges_m": RANGE_EDGES.tolist(),
-            "range_share": s.ranges.mean(axis=0).round(4).tolist(), "range_share_spread": s.ranges.std(axis=0).round(4).tolist(),
+            "range_share": s.ranges.mean(axis=0).round(4).tolist(),
+            "range_share_spread": s.ranges.std(axis=0).round(4).tolist(),
             "intensity_share": s.intensities.mean(axis=0).round(4).tolist(),
-            "median_points": {n: [None if np.isnan(v) else float(v) for v in median_points(o)] for n, o in s.objects.items()},
+            "median_points": {
+                n: [None if np.isnan(v) else float(v) for v in median_points(o)] for n, o in s.objects.items()
+            },
         }
 
     def labels(s: LabelStatistics) -> dict[str, Any]:
         quartiles = {n: np.percentile(d, [10, 50, 90]).round(1).tolist() for n, d in s.distances.items() if len(d)}
-        return {"frames": s.frames, "per_frame": s.per_frame, "frames_with": s.frames_with, "distance_10_50_90": quartiles,
-                "occlusion": {n: o.round(3).tolist() for n, o in s.occlusion.items()}}
+        return {
+            "frames": s.frames,
+            "per_frame": s.per_frame,
+            "frames_with": s.frames_with,
+            "distance_10_50_90": quartiles,
+            "occlusion": {n: o.round(3).tolist() for n, o in s.occlusion.items()},
+        }
 
     inside = np.abs(simulated.ranges.mean(axis=0) - real.ranges.mean(axis=0)) <= 2 * real.ranges.std(axis=0)
-    return {"real": {**scans(real), **labels(real_labels)}, "simulated": {**scans(simulated), **labels(simulated_labels)},
-            "range_classes_within_two_deviations": f"{int(inside.sum())} of {len(inside)}"}
+    return {
+        "real": {**scans(real), **labels(real_labels)},
+        "simulated": {**scans(simulated), **labels(simulated_labels)},
+        "range_classes_within_two_deviations": f"{int(inside.sum())} of {len(inside)}",
+    }
 
 
-def draw(real: ScanStatistics, simulated: ScanStatistics, real_labels: LabelStatistics, simulated_labels: LabelStatistics, path: Path) -> None:
+def draw(
+    real: ScanStatistics,
+    simulated: ScanStatistics,
+    real_labels: LabelStatistics,
+    simulated_labels: LabelStatistics,
+    path: Path,
+) -> None:
     """Draw the comparison as a PNG with six panels.
 
     Raises:
@@ -168,14 +214,27 @@ def draw(real: ScanStatistics, simulated: ScanStatistics, real_labels: LabelStat
     both = ((real, "real KITTI", "#444444"), (simulated, "simulated", "#d9622b"))
     bins = np.linspace(60, 140, 21)
     for s, name, colour in both:
-        axes[0, 0].hist(s.counts / 1000, bins, alpha=0.55, color=colour, label=f"{name}, mean {s.counts.mean() / 1000:.1f}", density=True)
+        axes[0, 0].hist(
+            s.counts / 1000,
+            bins,
+            alpha=0.55,
+            color=colour,
+            label=f"{name}, mean {s.counts.mean() / 1000:.1f}",
+            density=True,
+        )
         centre = np.arange(len(RANGE_EDGES) - 1)
-        axes[0, 1].errorbar(centre, s.ranges.mean(axis=0), s.ranges.std(axis=0), color=colour, capsize=3, label=name, marker="o", ms=3)
+        axes[0, 1].errorbar(
+            centre, s.ranges.mean(axis=0), s.ranges.std(axis=0), color=colour, capsize=3, label=name, marker="o", ms=3
+        )
         middle = (INTENSITY_EDGES[1:] + INTENSITY_EDGES[:-1]) / 2
-        axes[0, 2].errorbar(middle, s.intensities.mean(axis=0), s.intensities.std(axis=0), color=colour, capsize=2, marker="o", ms=3)
+        axes[0, 2].errorbar(
+            middle, s.intensities.mean(axis=0), s.intensities.std(axis=0), color=colour, capsize=2, marker="o", ms=3
+        )
         for kind, style in (("Car", "-"), ("Pedestrian", "--"), ("Cyclist", ":")):
             d = (DISTANCE_EDGES[1:] + DISTANCE_EDGES[:-1]) / 2
-            axes[1, 0].plot(d, median_points(s.objects[kind]), style, color=colour, marker="o", ms=3, label=f"{kind}, {name}")
+            axes[1, 0].plot(
+                d, median_points(s.objects[kind]), style, color=colour, marker="o", ms=3, label=f"{kind}, {name}"
+            )
             axes[1, 0].scatter(s.objects[kind][:, 0], s.objects[kind][:, 1], s=3, color=colour, alpha=0.25)
     axes[0, 0].set(title="points per scan (thousands)")
     axes[0, 1].set(title="share of points by range (m)", xticks=centre, yscale="log", ylim=(1e-3, 0.6))
@@ -183,11 +242,17 @@ def draw(real: ScanStatistics, simulated: ScanStatistics, real_labels: LabelStat
     axes[0, 2].set(title="intensity of returns")
     axes[1, 0].set(title="points per clear object by distance (m)", yscale="log", xlim=(0, 70), ylim=(1, 20000))
     names = ("Car", "Van", "Truck", "Pedestrian", "Cyclist", "DontCare")
-    for shift, (s, name, colour) in zip((-0.2, 0.2), ((real_labels, "real KITTI", "#444444"), (simulated_labels, "simulated", "#d9622b")), strict=True):
-        axes[1, 1].bar(np.arange(len(names)) + shift, [s.per_frame.get(n, 0) for n in names], 0.4, color=colour, label=name)
-        axes[1, 2].hist(s.distances.get("Car", np.zeros(0)), np.arange(0, 85, 5), density=True, alpha=0.55, color=colour, label=f"Car, {name}")
-        people = np.concatenate([s.distances.get("Pedestrian", np.zeros(0)), s.distances.get("Cyclist", np.zeros(0))])
-        axes[1, 2].hist(people, np.arange(0, 85, 5), density=True, histtype="step", lw=1.6, color=colour, label=f"Ped. + Cyc., {name}")
+    sides = ((-0.2, real_labels, "real KITTI", "#444444"), (0.2, simulated_labels, "simulated", "#d9622b"))
+    none = np.zeros(0)
+    for shift, t, name, colour in sides:
+        axes[1, 1].bar(
+            np.arange(len(names)) + shift, [t.per_frame.get(n, 0) for n in names], 0.4, color=colour, label=name
+        )
+        cars, people = t.distances.get("Car", none), [t.distances.get(n, none) for n in ("Pedestrian", "Cyclist")]
+        edges = np.arange(0, 85, 5)
+        axes[1, 2].hist(cars, edges, density=True, alpha=0.55, color=colour, label=f"Car, {name}")
+        label = f"Pedestrian, Cyclist, {name}"
+        axes[1, 2].hist(np.concatenate(people), edges, density=True, histtype="step", lw=1.6, color=colour, label=label)
     axes[1, 1].set(title="labels per frame", xticks=np.arange(len(names)))
     axes[1, 1].set_xticklabels(names, fontsize=8)
     axes[1, 2].set(title="distance of labels (m)")
@@ -199,9 +264,16 @@ def draw(real: ScanStatistics, simulated: ScanStatistics, real_labels: LabelStat
     figure.savefig(path)
 
 
-def compare(real_root: Path, simulated_root: Path, figure: Path | None = None, real_label_ids: Sequence[str] | None = None) -> dict[str, Any]:
+def compare(
+    real_root: Path, simulated_root: Path, figure: Path | None = None, real_label_ids: Sequence[str] | None = None
+) -> dict[str, Any]:
     """Compare two KITTI-layout folders; writes the figure if asked, returns the numbers."""
-    parts = (scan_statistics(real_root), scan_statistics(simulated_root), label_statistics(real_root, real_label_ids), label_statistics(simulated_root))
+    parts = (
+        scan_statistics(real_root),
+        scan_statistics(simulated_root),
+        label_statistics(real_root, real_label_ids),
+        label_statistics(simulated_root),
+    )
     if figure is not None:
         draw(*parts, figure)
     return summary(*parts)

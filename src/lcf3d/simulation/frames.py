@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from lcf3d.errors import ConfigError
 from lcf3d.formats.kitti import KittiObjects, detections_3d
 from lcf3d.geometry.boxes import points_in_boxes, transform_boxes
+from lcf3d.geometry.rotation import invert_rigid
 from lcf3d.simulation.actors import KITTI_CLASS, NUSCENES_CLASS, Actor
 from lcf3d.simulation.camera import Render, Stage, measure_exposure, render
 from lcf3d.simulation.labels import MAX_HIDDEN, Sightings, kitti_objects, sight
@@ -21,7 +22,17 @@ from lcf3d.simulation.light import make_light
 from lcf3d.simulation.presets import Preset, get_preset
 from lcf3d.simulation.rays import RayTracer
 from lcf3d.simulation.scene import Scene, build_scene
-from lcf3d.structures import KITTI_CLASSES, NUSCENES_CLASSES, Camera, Detections2D, Detections3D, FloatArray, Frame, InstanceMask, IntArray
+from lcf3d.structures import (
+    KITTI_CLASSES,
+    NUSCENES_CLASSES,
+    Camera,
+    Detections2D,
+    Detections3D,
+    FloatArray,
+    Frame,
+    InstanceMask,
+    IntArray,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +90,14 @@ class SimulatedFrame:
         labels = np.array([NUSCENES_CLASSES.index(names[k]) for k in kept], dtype=np.int64)
         velocity = np.array([self.actors[k].motion.velocity(self.time) for k in kept]).reshape(-1, 2)
         attributes = np.array([attribute(self.actors[k]) for k in kept], dtype=np.str_)
-        return Detections3D(self.boxes[kept], np.ones(len(kept)), labels, NUSCENES_CLASSES, velocity @ self.world_from_lidar[:2, :2], attributes)
+        return Detections3D(
+            self.boxes[kept],
+            np.ones(len(kept)),
+            labels,
+            NUSCENES_CLASSES,
+            velocity @ self.world_from_lidar[:2, :2],
+            attributes,
+        )
 
     @property
     def frame(self) -> Frame:
@@ -111,7 +129,13 @@ class SimulatedFrame:
             labels.append(class_names.index(name))
             x1, y1, x2, y2 = seen.boxes2d[k].astype(int)
             masks.append(InstanceMask(x1, y1, owner[y1:y2, x1:x2] == actor.id))
-        return Detections2D(np.array(boxes).reshape(-1, 4), np.ones(len(boxes)), np.array(labels, dtype=np.int64), class_names, tuple(masks))
+        return Detections2D(
+            np.array(boxes).reshape(-1, 4),
+            np.ones(len(boxes)),
+            np.array(labels, dtype=np.int64),
+            class_names,
+            tuple(masks),
+        )
 
 
 def attribute(actor: Actor) -> str:
@@ -129,7 +153,9 @@ def attribute(actor: Actor) -> str:
     return "vehicle.moving" if moving else "vehicle.stopped" if actor.stopped else "vehicle.parked"
 
 
-def capture(scene: Scene, preset: Preset, time: float, seed: tuple[int, ...], id: str, images: bool = True, threads: int = 2) -> SimulatedFrame:
+def capture(
+    scene: Scene, preset: Preset, time: float, seed: tuple[int, ...], id: str, images: bool = True, threads: int = 2
+) -> SimulatedFrame:
     """What the sensors of ``preset`` deliver ``time`` seconds into a scene.
 
     Args:
@@ -145,7 +171,7 @@ def capture(scene: Scene, preset: Preset, time: float, seed: tuple[int, ...], id
         MissingExtraError: embreex is not installed.
     """
     stage = make_stage(scene, preset, time)
-    lidar_from_world = np.linalg.inv(stage.world_from_lidar)
+    lidar_from_world = invert_rigid(stage.world_from_lidar[None])[0]
     boxes = transform_boxes(scene.boxes(time), lidar_from_world)
     sensor = np.random.default_rng([*seed, 1])
     renders: dict[str, Render] = {}
@@ -161,7 +187,9 @@ def capture(scene: Scene, preset: Preset, time: float, seed: tuple[int, ...], id
     return SimulatedFrame(id, preset, scene, time, stage.world_from_lidar, turn, renders, boxes, points_on, sightings)
 
 
-def _look(scene: Scene, preset: Preset, stage: Stage, boxes: FloatArray, seed: tuple[int, ...], pool: ThreadPoolExecutor) -> tuple[dict[str, Render], dict[str, Sightings]]:
+def _look(
+    scene: Scene, preset: Preset, stage: Stage, boxes: FloatArray, seed: tuple[int, ...], pool: ThreadPoolExecutor
+) -> tuple[dict[str, Render], dict[str, Sightings]]:
     """Images and sightings of all cameras."""
     corners = [stage.mesh.corners[stage.owner == actor.id] for actor in scene.actors]
     shared = measure_exposure(preset.cameras[0], stage)
@@ -176,7 +204,9 @@ def _look(scene: Scene, preset: Preset, stage: Stage, boxes: FloatArray, seed: t
     numbers = range(len(preset.cameras))
     results = list(pool.map(one, numbers))
     names = [camera.name for camera in preset.cameras]
-    return {n: r for n, (r, _) in zip(names, results, strict=True)}, {n: s for n, (_, s) in zip(names, results, strict=True)}
+    return {n: r for n, (r, _) in zip(names, results, strict=True)}, {
+        n: s for n, (_, s) in zip(names, results, strict=True)
+    }
 
 
 def make_stage(scene: Scene, preset: Preset, time: float) -> Stage:
@@ -186,7 +216,9 @@ def make_stage(scene: Scene, preset: Preset, time: float) -> Stage:
     pose = np.eye(4)
     pose[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
     pose[:3, 3] = x, y, float(scene.site.terrain.height(x, y)) + preset.lidar.height_m
-    light = make_light(scene.sun, scene.cloudiness, scene.haze_m, scene.look, preset.rain, preset.night, lamp_positions(scene, x))
+    light = make_light(
+        scene.sun, scene.cloudiness, scene.haze_m, scene.look, preset.rain, preset.night, lamp_positions(scene, x)
+    )
     return Stage(RayTracer(snapshot.mesh.corners), snapshot.mesh, snapshot.owner, light, scene.site.markings(), pose)
 
 
@@ -197,8 +229,16 @@ def lamp_positions(scene: Scene, around: float) -> NDArray[np.float64]:
     return np.concatenate([near, np.full((len(near), 1), 14.0)], axis=1)
 
 
-def simulate_frame(preset: str | Preset = "kitti64", seed: int = 0, index: int = 0, *, street: str | None = None, density: float = 1.0,
-                   images: bool = True, threads: int = 2) -> SimulatedFrame:
+def simulate_frame(
+    preset: str | Preset = "kitti64",
+    seed: int = 0,
+    index: int = 0,
+    *,
+    street: str | None = None,
+    density: float = 1.0,
+    images: bool = True,
+    threads: int = 2,
+) -> SimulatedFrame:
     """One single frame in a scene of its own.
 
     Args:
@@ -214,11 +254,23 @@ def simulate_frame(preset: str | Preset = "kitti64", seed: int = 0, index: int =
         ConfigError: unknown preset or street, or a density that the street cannot hold.
         MissingExtraError: embreex is not installed.
     """
-    return next(simulate_drive(preset, seed, 1, drive=index, street=street, density=density, images=images, threads=threads))
+    return next(
+        simulate_drive(preset, seed, 1, drive=index, street=street, density=density, images=images, threads=threads)
+    )
 
 
-def simulate_drive(preset: str | Preset = "kitti64", seed: int = 0, frames: int = 20, *, drive: int = 0, street: str | None = None,
-                   density: float = 1.0, images: bool = True, threads: int = 2, first: int = 0) -> Iterator[SimulatedFrame]:
+def simulate_drive(
+    preset: str | Preset = "kitti64",
+    seed: int = 0,
+    frames: int = 20,
+    *,
+    drive: int = 0,
+    street: str | None = None,
+    density: float = 1.0,
+    images: bool = True,
+    threads: int = 2,
+    first: int = 0,
+) -> Iterator[SimulatedFrame]:
     """A drive through one scene, at the preset's frame rate, with tracks that keep their ids.
 
     Args:

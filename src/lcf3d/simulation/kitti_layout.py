@@ -13,7 +13,7 @@ from lcf3d.formats.files import atomic_path, write_text
 from lcf3d.formats.kitti import write_objects
 from lcf3d.simulation.frames import SimulatedFrame
 from lcf3d.simulation.labels import label_order
-from lcf3d.simulation.presets import kitti_calibration
+from lcf3d.simulation.presets import KITTI_FOCAL, Preset, kitti_calibration
 
 IMAGE_FOLDERS: Final = {"left": "image_2", "right": "image_3"}
 VAL_EVERY: Final = 5
@@ -22,7 +22,15 @@ VAL_EVERY: Final = 5
 
 def frame_paths(root: Path, id: str) -> dict[str, Path]:
     """The files of a frame by folder name; ``label_2`` is the one written last."""
-    suffixes = {"calib": "txt", "velodyne": "bin", "image_2": "png", "image_3": "png", "instance_2": "png", "tracks": "txt", "label_2": "txt"}
+    suffixes = {
+        "calib": "txt",
+        "velodyne": "bin",
+        "image_2": "png",
+        "image_3": "png",
+        "instance_2": "png",
+        "tracks": "txt",
+        "label_2": "txt",
+    }
     return {folder: root / "training" / folder / f"{id}.{suffix}" for folder, suffix in suffixes.items()}
 
 
@@ -34,16 +42,18 @@ def is_complete(root: Path, id: str) -> bool:
 def write_frame(root: Path, id: str, simulated: SimulatedFrame) -> None:
     """Write scan, images, calibration, instance ids, track numbers and labels of a frame.
 
-    ``instance_2`` is a 16-bit PNG of the size of the left image whose values are track numbers (0 for everything that is no
-    object); line ``k`` of ``tracks`` is the track number of line ``k`` of ``label_2``.
+    ``instance_2`` is a 16-bit PNG of the size of the left image whose values are track numbers (0 for
+    everything that is no object); line ``k`` of ``tracks`` is the track number of line ``k`` of ``label_2``.
     """
     paths = frame_paths(root, id)
-    write_text(paths["calib"], calibration_text())
+    write_text(paths["calib"], calibration_text(simulated.preset))
     write_bytes(paths["velodyne"], np.ascontiguousarray(simulated.scan.points, dtype="<f4").tobytes())
     for camera, folder in IMAGE_FOLDERS.items():
         write_png(paths[folder], simulated.renders[camera].image)
     write_png(paths["instance_2"], simulated.renders["left"].owner.astype(np.uint16))
-    order = label_order(simulated.actors, simulated.boxes, simulated.sightings["left"], simulated.points_on)[0]
+    order = label_order(
+        simulated.actors, simulated.boxes, simulated.sightings["left"], simulated.points_on, simulated.preset.cameras[0]
+    )[0]
     write_text(paths["tracks"], "".join(f"{simulated.actors[k].id}\n" for k in order))
     write_objects(paths["label_2"], simulated.kitti)
 
@@ -62,14 +72,16 @@ def write_png(path: Path, image: NDArray[np.uint8] | NDArray[np.uint16]) -> None
         Image.fromarray(image).save(temporary, format="PNG", compress_level=1)
 
 
-def calibration_text() -> str:
-    """The calibration file of every simulated frame, with the entries of a real one."""
-    lines = [f"{name}: " + " ".join(f"{v:.12e}" for v in matrix.ravel()) for name, matrix in kitti_calibration().items()]
+def calibration_text(preset: Preset) -> str:
+    """The calibration file of a preset's frames, with the entries of a real one."""
+    scale = np.diag([*(preset.cameras[0].intrinsics.diagonal()[:2] / KITTI_FOCAL), 1.0])
+    entries = {n: scale @ m if n.startswith("P") else m for n, m in kitti_calibration().items()}
+    lines = [f"{name}: " + " ".join(f"{v:.12e}" for v in matrix.ravel()) for name, matrix in entries.items()]
     return "\n".join(lines) + "\n"
 
 
 def write_splits(root: Path, ids: Sequence[str], frames_per_drive: int) -> None:
-    """Write ``ImageSets/train.txt`` and ``val.txt``; a drive is never divided between them unless it is the only one."""
+    """Write ``ImageSets/train.txt`` and ``val.txt``; no drive is divided unless it is the only one."""
     groups = [ids[k : k + frames_per_drive] for k in range(0, len(ids), frames_per_drive)]
     if len(groups) == 1:
         groups = [[id] for id in ids]

@@ -14,17 +14,19 @@ from lcf3d.geometry.boxes import box_corners, kitti_from_lidar, observation_angl
 from lcf3d.geometry.camera import NEAR, project_boxes
 from lcf3d.simulation.actors import KITTI_CLASS, Actor
 from lcf3d.simulation.camera import camera_rays
+from lcf3d.simulation.presets import KITTI_FOCAL
 from lcf3d.simulation.rays import RayTracer
 from lcf3d.structures import Camera, FloatArray, IntArray
 
 OCCLUSION_LIMITS: Final = (0.12, 0.50, 0.90)
-"""Hidden share of the part inside the image above which an object is partly (1), largely (2) and not recognisably (3) visible."""
+"""Hidden share of the part inside the image from which an object is partly (1), largely (2), almost (3) hidden."""
 MIN_HEIGHT_PX: Final = {"Pedestrian": 26.0, "Person_sitting": 26.0, "Cyclist": 24.0}
 """Objects of a class that are lower than this in the image (others: `MIN_VEHICLE_HEIGHT_PX`) become DontCare."""
-MIN_VEHICLE_HEIGHT_PX: Final = 13.0
-MIN_IGNORED_HEIGHT_PX: Final = 9.0
-"""Nothing lower than this in the image is mentioned at all, as in KITTI."""
-MIN_IGNORED_PIXELS: Final = 25
+MIN_VEHICLE_HEIGHT_PX: Final = 15.5
+MIN_LABELLED_PIXELS: Final = 15
+MIN_IGNORED_HEIGHT_PX: Final = 10.0
+"""What is lower in the image, or has fewer visible pixels than the next number, is not mentioned at all."""
+MIN_IGNORED_PIXELS: Final = 40
 MAX_HIDDEN: Final = 0.97
 """Objects of which less than this share is hidden are labelled; others become DontCare."""
 MAX_DISTANCE_M: Final = 80.0
@@ -51,8 +53,14 @@ class Sightings:
     truncated: FloatArray
 
 
-def sight(camera: Camera, owner: NDArray[np.int32], actors: Sequence[Actor], corners: Sequence[NDArray[np.floating]],
-          boxes: FloatArray, world_from_lidar: FloatArray) -> Sightings:
+def sight(
+    camera: Camera,
+    owner: NDArray[np.int32],
+    actors: Sequence[Actor],
+    corners: Sequence[NDArray[np.floating]],
+    boxes: FloatArray,
+    world_from_lidar: FloatArray,
+) -> Sightings:
     """Sightings from the (H, W) ``owner`` image of a camera.
 
     Args:
@@ -74,17 +82,23 @@ def sight(camera: Camera, owner: NDArray[np.int32], actors: Sequence[Actor], cor
     rows, columns = np.nonzero(owner)
     whose = index[owner[rows, columns]]
     pixels += np.bincount(whose, minlength=n)[:n]
-    for k in np.flatnonzero(pixels):
+    for k in np.flatnonzero(pixels).tolist():
         mine = whose == k
         v, u = rows[mine], columns[mine]
         visible[k] = u.min(), v.min(), u.max() + 1, v.max() + 1
-    for k in np.flatnonzero(inside & (pixels > 0)):
+    for k in np.flatnonzero(inside & (pixels > 0)).tolist():
         hidden[k], truncated[k] = _coverage(camera, owner, actors[k].id, corners[k], boxes[k], world_from_lidar)
     return Sightings(visible, amodal, pixels, hidden, truncated)
 
 
-def _coverage(camera: Camera, owner: NDArray[np.int32], id: int, corners: NDArray[np.floating], box: FloatArray,
-              world_from_lidar: FloatArray) -> tuple[float, float]:
+def _coverage(
+    camera: Camera,
+    owner: NDArray[np.int32],
+    id: int,
+    corners: NDArray[np.floating],
+    box: FloatArray,
+    world_from_lidar: FloatArray,
+) -> tuple[float, float]:
     """(hidden share of the part inside the image, share outside) of one object, by a raster of rays at it alone."""
     around = _unclipped_bounds(box, camera)
     u, v = _raster(around)
@@ -127,11 +141,13 @@ def occlusion_level(hidden: FloatArray) -> IntArray:
     return np.digitize(hidden, OCCLUSION_LIMITS).astype(np.int64)
 
 
-def kitti_objects(actors: Sequence[Actor], boxes: FloatArray, sightings: Sightings, points_on: IntArray, camera: Camera) -> KittiObjects:
+def kitti_objects(
+    actors: Sequence[Actor], boxes: FloatArray, sightings: Sightings, points_on: IntArray, camera: Camera
+) -> KittiObjects:
     """The label file of a frame, as seen by the left camera.
 
-    An object is labelled when some of it is visible, it is high enough in the image, and a beam met it or it is near; what is
-    visible but far, tiny or nearly covered becomes DontCare.
+    An object is labelled when some of it is visible, it is high enough in the image, and a beam met it or it is
+    near; what is visible but far, tiny or nearly covered becomes DontCare.
 
     Args:
         actors: the A actors.
@@ -140,11 +156,14 @@ def kitti_objects(actors: Sequence[Actor], boxes: FloatArray, sightings: Sightin
         points_on: (A,) LiDAR returns from each.
         camera: the left camera.
     """
-    order, count = label_order(actors, boxes, sightings, points_on)
+    order, count = label_order(actors, boxes, sightings, points_on, camera)
     names = np.array([KITTI_CLASS[a.kind] or "" for a in actors], dtype=np.str_)
     total = len(order)
-    locations, dimensions, rotation = kitti_from_lidar(boxes[order], camera.camera_from_lidar) if total else (
-        np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
+    locations, dimensions, rotation = (
+        kitti_from_lidar(boxes[order], camera.camera_from_lidar)
+        if total
+        else (np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
+    )
     alpha = wrap_angle(observation_angle(locations, rotation))
     is_ignored = np.arange(total) >= count
     truncated = np.where(is_ignored, -1.0, np.round(sightings.truncated[order], 2))
@@ -161,13 +180,20 @@ def kitti_objects(actors: Sequence[Actor], boxes: FloatArray, sightings: Sightin
     )
 
 
-def label_order(actors: Sequence[Actor], boxes: FloatArray, sightings: Sightings, points_on: IntArray) -> tuple[IntArray, int]:
-    """Indices of the actors in a KITTI label file, and how many of them, from the first, are not DontCare."""
+def label_order(
+    actors: Sequence[Actor], boxes: FloatArray, sightings: Sightings, points_on: IntArray, camera: Camera
+) -> tuple[IntArray, int]:
+    """Indices of the actors in a KITTI label file, and how many of them, from the first, are not DontCare.
+
+    Pixel limits hold for KITTI's focal length and grow with that of the camera.
+    """
+    scale = float(camera.intrinsics[1, 1]) / KITTI_FOCAL
     known = np.array([KITTI_CLASS[a.kind] is not None for a in actors], dtype=bool)
-    height = sightings.boxes2d[:, 3] - sightings.boxes2d[:, 1]
+    height = (sightings.boxes2d[:, 3] - sightings.boxes2d[:, 1]) / scale
+    pixels = sightings.pixels / scale**2
     distance = np.linalg.norm(boxes[:, :2], axis=1)
     least = np.array([MIN_HEIGHT_PX.get(KITTI_CLASS[a.kind] or "", MIN_VEHICLE_HEIGHT_PX) for a in actors])
-    labelled = known & (sightings.pixels >= 12) & (height >= least) & (sightings.hidden < MAX_HIDDEN)
+    labelled = known & (pixels >= MIN_LABELLED_PIXELS) & (height >= least) & (sightings.hidden < MAX_HIDDEN)
     labelled &= ((points_on > 0) | (distance < 60)) & (distance < MAX_DISTANCE_M)
-    ignored = known & (sightings.pixels >= MIN_IGNORED_PIXELS) & (height >= MIN_IGNORED_HEIGHT_PX) & ~labelled
+    ignored = known & (pixels >= MIN_IGNORED_PIXELS) & (height >= MIN_IGNORED_HEIGHT_PX) & ~labelled
     return np.concatenate([np.flatnonzero(labelled), np.flatnonzero(ignored)]), int(labelled.sum())

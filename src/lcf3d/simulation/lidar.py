@@ -1,4 +1,4 @@
-"""A spinning LiDAR in a scene: beams in firing order, surfaces that swallow, mirror or let them through, noise and rain."""
+"""A spinning LiDAR in a scene: beams in firing order; surfaces that swallow, mirror or let them pass; noise, rain."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ class Scan:
     """One turn of the LiDAR, moved to where the sensor is at the middle of the turn.
 
     Attributes:
-        points: (N, 4) float32 x, y, z (LiDAR frame, x forward, y left, z up) and intensity in [0, 1], ring by ring from the top
-            ring down, each in firing order.
+        points: (N, 4) float32 x, y, z (LiDAR frame, x forward, y left, z up) and intensity in [0, 1], ring by ring
+            from the top ring down, each in firing order.
         ring: (N,) int32, 0 for the lowest beam.
         owner: (N,) int32 id of the actor that sent the beam back, 0 for scenery.
     """
@@ -48,7 +48,8 @@ def beam_directions(spec: LidarSpec) -> tuple[Floats, NDArray[np.int32], Floats]
     azimuth = np.pi - 2 * np.pi * (share[None, :] + offset[:, None])
     elevation = np.radians(np.array(spec.elevations_deg)[rings])[:, None]
     direction = np.stack(
-        [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation) + 0 * azimuth], axis=-1
+        [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation) + 0 * azimuth],
+        axis=-1,
     )
     time = np.broadcast_to((share - 0.5) / spec.rate_hz, azimuth.shape)
     ring = np.broadcast_to(rings[:, None], azimuth.shape)
@@ -77,8 +78,26 @@ def scan(spec: LidarSpec, stage: Stage, velocity: tuple[float, float], rain: flo
     mesh = stage.mesh
     intensity = np.empty(len(direction), dtype=np.float32)
     kept = np.empty(len(direction), dtype=np.bool_)
-    reflect(triangle, distance, u, v, direction, mesh.corners, mesh.uv, mesh.material, mesh.colour, mesh.seed, lidar_table(), stage.road,
-            chance, spec.sensitivity * (1.0 - 0.45 * rain), spec.base_loss, 0.012 * rain, intensity, kept)
+    reflect(
+        triangle,
+        distance,
+        u,
+        v,
+        direction,
+        mesh.corners,
+        mesh.uv,
+        mesh.material,
+        mesh.colour,
+        mesh.seed,
+        lidar_table(),
+        stage.road,
+        chance,
+        spec.sensitivity * (1.0 - 0.45 * rain),
+        spec.base_loss,
+        0.012 * rain,
+        intensity,
+        kept,
+    )
     noise = rng.standard_normal((len(direction), 2), dtype=np.float32)
     measured = distance + noise[:, 0] * np.float32(spec.noise_m)
     owner = np.where(triangle >= 0, stage.owner[triangle], 0).astype(np.int32)
@@ -91,8 +110,16 @@ def scan(spec: LidarSpec, stage: Stage, velocity: tuple[float, float], rain: flo
     return Scan(points[kept], ring[kept], owner[kept])
 
 
-def _through_glass(stage: Stage, origin: Floats, direction: Floats, triangle: NDArray[np.int32], distance: Floats, u: Floats, v: Floats,
-                   chance: Floats) -> None:
+def _through_glass(
+    stage: Stage,
+    origin: Floats,
+    direction: Floats,
+    triangle: NDArray[np.int32],
+    distance: Floats,
+    u: Floats,
+    v: Floats,
+    chance: Floats,
+) -> None:
     """Beams that meet glass: one in ten comes back, half are mirrored away, the others go on to what lies behind."""
     glass = lidar_table()[:, 3] > 0
     for _ in range(_GLASS_PASSES):
@@ -109,8 +136,14 @@ def _through_glass(stage: Stage, origin: Floats, direction: Floats, triangle: ND
         triangle[here], distance[here], u[here], v[here] = behind.triangle, behind.distance + step, behind.u, behind.v
 
 
-def _droplets(rain: float, measured: Floats, intensity: Floats, kept: NDArray[np.bool_], owner: NDArray[np.int32],
-              rng: np.random.Generator) -> None:
+def _droplets(
+    rain: float,
+    measured: Floats,
+    intensity: Floats,
+    kept: NDArray[np.bool_],
+    owner: NDArray[np.int32],
+    rng: np.random.Generator,
+) -> None:
     """Beams that a raindrop near the sensor sends back."""
     n = len(measured)
     hit = np.flatnonzero(rng.random(n, dtype=np.float32) < 0.012 * rain)
@@ -121,8 +154,26 @@ def _droplets(rain: float, measured: Floats, intensity: Floats, kept: NDArray[np
 
 
 @njit(cache=True, nogil=True)
-def reflect(triangle, distance, u, v, direction, corners, uv, material, colour, seed, table, road, chance, sensitivity, base_loss,
-            fog, intensity, kept):  # type: ignore[no-untyped-def]
+def reflect(  # type: ignore[no-untyped-def]
+    triangle,
+    distance,
+    u,
+    v,
+    direction,
+    corners,
+    uv,
+    material,
+    colour,
+    seed,
+    table,
+    road,
+    chance,
+    sensitivity,
+    base_loss,
+    fog,
+    intensity,
+    kept,
+):
     """Intensity of N beams and whether they come back, into ``intensity`` and ``kept`` (N,)."""
     scratch = np.empty(3, np.float32)
     for i in range(len(triangle)):
@@ -132,8 +183,16 @@ def reflect(triangle, distance, u, v, direction, corners, uv, material, colour, 
         if t < 0:
             continue
         m = material[t]
-        ax, ay, az = corners[t, 1, 0] - corners[t, 0, 0], corners[t, 1, 1] - corners[t, 0, 1], corners[t, 1, 2] - corners[t, 0, 2]
-        bx, by, bz = corners[t, 2, 0] - corners[t, 0, 0], corners[t, 2, 1] - corners[t, 0, 1], corners[t, 2, 2] - corners[t, 0, 2]
+        ax, ay, az = (
+            corners[t, 1, 0] - corners[t, 0, 0],
+            corners[t, 1, 1] - corners[t, 0, 1],
+            corners[t, 1, 2] - corners[t, 0, 2],
+        )
+        bx, by, bz = (
+            corners[t, 2, 0] - corners[t, 0, 0],
+            corners[t, 2, 1] - corners[t, 0, 1],
+            corners[t, 2, 2] - corners[t, 0, 2],
+        )
         nx, ny, nz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
         length = math.sqrt(nx * nx + ny * ny + nz * nz) + 1e-20
         cosine = abs(nx * direction[i, 0] + ny * direction[i, 1] + nz * direction[i, 2]) / length
@@ -157,7 +216,13 @@ def reflect(triangle, distance, u, v, direction, corners, uv, material, colour, 
         value = reflectance * (0.55 + 0.45 * cosine)
         if table[m, 2] > 0:
             value = min(0.99, value * (1 + table[m, 2] * cosine * cosine))
-        signal = sensitivity * reflectance * (0.12 + 0.88 * cosine) / (distance[i] * distance[i]) * math.exp(-2 * fog * distance[i])
+        signal = (
+            sensitivity
+            * reflectance
+            * (0.12 + 0.88 * cosine)
+            / (distance[i] * distance[i])
+            * math.exp(-2 * fog * distance[i])
+        )
         if chance[i, 1] < base_loss or chance[i, 2] > 1 - math.exp(-signal * 4):
             continue
         kept[i] = True

@@ -45,13 +45,30 @@ class Light:
 
     def numbers(self, eye: NDArray[np.float64], forward: NDArray[np.float64]) -> NDArray[np.float32]:
         """(26 + 4 L,) float32: what the shader reads, with the position and direction of the car's headlamps."""
-        head = [*self.sun, *self.sun_colour, *self.sky_ambient, *self.ground_ambient, *self.haze_colour, self.haze_m, self.wet,
-                self.night, *eye, *forward, len(self.lamps), 0.0]
+        head = [
+            *self.sun,
+            *self.sun_colour,
+            *self.sky_ambient,
+            *self.ground_ambient,
+            *self.haze_colour,
+            self.haze_m,
+            self.wet,
+            self.night,
+            *eye,
+            *forward,
+            len(self.lamps),
+            0.0,
+        ]
         return np.array([*head, *self.lamps.reshape(-1)], dtype=np.float32)
 
 
 def make_light(
-    sun: NDArray[np.float64], cloudiness: float, haze_m: float, look: int, rain: float = 0.0, night: bool = False,
+    sun: NDArray[np.float64],
+    cloudiness: float,
+    haze_m: float,
+    look: int,
+    rain: float = 0.0,
+    night: bool = False,
     lamps: NDArray[np.float64] | None = None,
 ) -> Light:
     """The light of a scene by day or night, dry or in ``rain`` (0 to 1)."""
@@ -66,16 +83,30 @@ def make_light(
     if night:
         sun_colour, ambient = sun_colour * 0.008, np.array([0.010, 0.013, 0.022])
     lit_ground = 0.13 * (sun_colour * max(sun[2], 0.1) + ambient)
-    haze = (np.array([0.62, 0.70, 0.80]) * (1 - cover) + np.array([0.70, 0.72, 0.75]) * cover) * (0.012 if night else 1.0)
+    haze = (np.array([0.62, 0.70, 0.80]) * (1 - cover) + np.array([0.70, 0.72, 0.75]) * cover) * (
+        0.012 if night else 1.0
+    )
     sky = _sky(sun, cloudiness, haze, look, night)
     if rain:
         haze_m = min(haze_m, 320.0 * (1.2 - rain))
     no_lamps = np.zeros((0, 4))
-    return Light(sun, sun_colour, ambient, lit_ground, haze, haze_m, float(min(1.0, rain * 1.3)), float(night),
-                 no_lamps if lamps is None or not night else lamps[:MAX_LAMPS], sky)
+    return Light(
+        sun,
+        sun_colour,
+        ambient,
+        lit_ground,
+        haze,
+        haze_m,
+        float(min(1.0, rain * 1.3)),
+        float(night),
+        no_lamps if lamps is None or not night else lamps[:MAX_LAMPS],
+        sky,
+    )
 
 
-def _sky(sun: NDArray[np.float64], cloudiness: float, haze: NDArray[np.float64], look: int, night: bool) -> NDArray[np.float32]:
+def _sky(
+    sun: NDArray[np.float64], cloudiness: float, haze: NDArray[np.float64], look: int, night: bool
+) -> NDArray[np.float32]:
     elevation = (np.arange(SKY_HEIGHT) + 0.5) / SKY_HEIGHT * np.pi / 2
     azimuth = (np.arange(SKY_WIDTH) + 0.5) / SKY_WIDTH * 2 * np.pi - np.pi
     e, a = np.meshgrid(elevation, azimuth, indexing="ij")
@@ -99,4 +130,5 @@ def _sky(sun: NDArray[np.float64], cloudiness: float, haze: NDArray[np.float64],
     result = base * (1 - cover[:, :, None]) + (bright * cover)[:, :, None] * colour
     if night:
         result = result * 0.010 + np.array([0.004, 0.004, 0.006])
-    return result.astype(np.float32)
+    sky: NDArray[np.float32] = result.astype(np.float32)
+    return sky

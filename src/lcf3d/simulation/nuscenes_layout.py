@@ -25,13 +25,26 @@ VERSION: Final = "v1.0-simulated"
 START_US: Final = 1_600_000_000_000_000
 """Time of the first frame in microseconds; drives are 100 s apart."""
 CATEGORIES: Final = {
-    "car": "vehicle.car", "truck": "vehicle.truck", "bus": "vehicle.bus.rigid", "trailer": "vehicle.trailer",
-    "construction_vehicle": "vehicle.construction", "pedestrian": "human.pedestrian.adult", "motorcycle": "vehicle.motorcycle",
-    "bicycle": "vehicle.bicycle", "traffic_cone": "movable_object.trafficcone", "barrier": "movable_object.barrier",
+    "car": "vehicle.car",
+    "truck": "vehicle.truck",
+    "bus": "vehicle.bus.rigid",
+    "trailer": "vehicle.trailer",
+    "construction_vehicle": "vehicle.construction",
+    "pedestrian": "human.pedestrian.adult",
+    "motorcycle": "vehicle.motorcycle",
+    "bicycle": "vehicle.bicycle",
+    "traffic_cone": "movable_object.trafficcone",
+    "barrier": "movable_object.barrier",
 }
 ATTRIBUTES: Final = (
-    "vehicle.moving", "vehicle.stopped", "vehicle.parked", "cycle.with_rider", "cycle.without_rider", "pedestrian.moving",
-    "pedestrian.standing", "pedestrian.sitting_lying_down",
+    "vehicle.moving",
+    "vehicle.stopped",
+    "vehicle.parked",
+    "cycle.with_rider",
+    "cycle.without_rider",
+    "pedestrian.moving",
+    "pedestrian.standing",
+    "pedestrian.sitting_lying_down",
 )
 VISIBILITY_LIMITS: Final = (0.4, 0.6, 0.8)
 _ORIGIN: Final = np.array([600.0, 1600.0, 0.0])
@@ -69,7 +82,10 @@ def write_frame(root: Path, id: str, simulated: SimulatedFrame) -> None:
         "timestamp": timestamp,
         "street": simulated.scene.site.street.name,
         "files": files,
-        "pose": {"translation": (pose[:3, 3] + _ORIGIN).tolist(), "rotation": quaternions_from_matrices(pose[None, :3, :3])[0].tolist()},
+        "pose": {
+            "translation": (pose[:3, 3] + _ORIGIN).tolist(),
+            "rotation": quaternions_from_matrices(pose[None, :3, :3])[0].tolist(),
+        },
         "sizes": {c.name: [c.width, c.height] for c in simulated.preset.cameras},
         "intrinsics": {c.name: c.intrinsics.tolist() for c in simulated.preset.cameras},
         "objects": _objects(simulated),
@@ -102,17 +118,23 @@ def _objects(simulated: SimulatedFrame) -> list[dict[str, Any]]:
         if np.hypot(*simulated.boxes[k, :2]) > _MAX_DISTANCE_M or (points == 0 and share < 0.05):
             continue
         length, width, height = actor.size
-        result.append({
-            "id": actor.id, "class": NUSCENES_CLASS[actor.kind], "attribute": attribute(actor),
-            "translation": (world[k, :3] + _ORIGIN).round(4).tolist(), "size": [width, length, height],
-            "rotation": quaternions_from_yaws(world[k, 6:7])[0].tolist(), "points": points,
-            "visibility": str(1 + int(np.digitize(min(share, 1.0), VISIBILITY_LIMITS))),
-        })
+        result.append(
+            {
+                "id": actor.id,
+                "class": NUSCENES_CLASS[actor.kind],
+                "attribute": attribute(actor),
+                "translation": (world[k, :3] + _ORIGIN).round(4).tolist(),
+                "size": [width, length, height],
+                "rotation": quaternions_from_yaws(world[k, 6:7])[0].tolist(),
+                "points": points,
+                "visibility": str(1 + int(np.digitize(min(share, 1.0), VISIBILITY_LIMITS))),
+            }
+        )
     return result
 
 
 def write_tables(root: Path, ids: Iterable[str], seed: int) -> None:
-    """Write the thirteen tables, the map placeholder and the scene lists ``train.txt`` and ``val.txt`` from the parts."""
+    """Write the thirteen tables, the map placeholder and the scene lists ``train.txt`` and ``val.txt``."""
     parts = [read_json(_part_path(root, id)) for id in ids]
     drives = sorted({part["drive"] for part in parts})
     tables = _fixed_tables(seed, parts[0])
@@ -133,10 +155,17 @@ def write_tables(root: Path, ids: Iterable[str], seed: int) -> None:
 def _fixed_tables(seed: int, part: dict[str, Any]) -> dict[str, list[dict[str, Any]]]:
     """Tables that do not depend on the drives."""
     sensors = [("LIDAR_TOP", "lidar", ego_from_nuscenes_lidar())]
-    sensors += [(name, "camera", ego_from_nuscenes_camera(position, yaw)) for name, position, yaw, _ in NUSCENES_CAMERAS]
+    sensors += [
+        (name, "camera", ego_from_nuscenes_camera(position, yaw)) for name, position, yaw, _ in NUSCENES_CAMERAS
+    ]
     calibrated = [
-        {"token": token(seed, "calibration", name), "sensor_token": token("sensor", name), "translation": pose[:3, 3].tolist(),
-         "rotation": quaternions_from_matrices(pose[None, :3, :3])[0].tolist(), "camera_intrinsic": part["intrinsics"].get(name, [])}
+        {
+            "token": token(seed, "calibration", name),
+            "sensor_token": token("sensor", name),
+            "translation": pose[:3, 3].tolist(),
+            "rotation": quaternions_from_matrices(pose[None, :3, :3])[0].tolist(),
+            "camera_intrinsic": part["intrinsics"].get(name, []),
+        }
         for name, _, pose in sensors
     ]
     levels = ("v0-40", "v40-60", "v60-80", "v80-100")
@@ -144,15 +173,40 @@ def _fixed_tables(seed: int, part: dict[str, Any]) -> dict[str, list[dict[str, A
     return {
         "sensor": [{"token": token("sensor", name), "channel": name, "modality": kind} for name, kind, _ in sensors],
         "calibrated_sensor": calibrated,
-        "category": [{"token": token("category", c), "name": c, "description": f"Simulated {k.replace('_', ' ')}."} for k, c in CATEGORIES.items()],
-        "attribute": [{"token": token("attribute", a), "name": a, "description": a.replace(".", " is ")} for a in ATTRIBUTES],
-        "visibility": [{"token": str(k + 1), "level": level, "description": f"visibility of whole object: {level[1:]} %"} for k, level in enumerate(levels)],
-        "log": [{"token": log, "logfile": "simulated", "vehicle": "simulated", "date_captured": "2020-09-13", "location": "simulated"}],
-        "map": [{"token": token(seed, "map"), "log_tokens": [log], "category": "semantic_prior", "filename": "maps/placeholder.png"}],
+        "category": [
+            {"token": token("category", c), "name": c, "description": f"Simulated {k.replace('_', ' ')}."}
+            for k, c in CATEGORIES.items()
+        ],
+        "attribute": [
+            {"token": token("attribute", a), "name": a, "description": a.replace(".", " is ")} for a in ATTRIBUTES
+        ],
+        "visibility": [
+            {"token": str(k + 1), "level": level, "description": f"visibility of whole object: {level[1:]} %"}
+            for k, level in enumerate(levels)
+        ],
+        "log": [
+            {
+                "token": log,
+                "logfile": "simulated",
+                "vehicle": "simulated",
+                "date_captured": "2020-09-13",
+                "location": "simulated",
+            }
+        ],
+        "map": [
+            {
+                "token": token(seed, "map"),
+                "log_tokens": [log],
+                "category": "semantic_prior",
+                "filename": "maps/placeholder.png",
+            }
+        ],
     }
 
 
-def _drive_tables(tables: dict[str, list[dict[str, Any]]], seed: int, drive: int, members: list[dict[str, Any]]) -> None:
+def _drive_tables(
+    tables: dict[str, list[dict[str, Any]]], seed: int, drive: int, members: list[dict[str, Any]]
+) -> None:
     """Append the rows of one drive."""
 
     def sample_token(k: int) -> str:
@@ -162,25 +216,52 @@ def _drive_tables(tables: dict[str, list[dict[str, Any]]], seed: int, drive: int
         return token(seed, "data", channel, drive, members[k]["number"]) if 0 <= k < len(members) else ""
 
     scene = token(seed, "scene", drive)
-    tables["scene"].append({
-        "token": scene, "log_token": token(seed, "log"), "nbr_samples": len(members), "first_sample_token": sample_token(0),
-        "last_sample_token": sample_token(len(members) - 1), "name": f"scene-{drive:04d}", "description": f"Simulated street: {members[0]['street']}",
-    })
+    tables["scene"].append(
+        {
+            "token": scene,
+            "log_token": token(seed, "log"),
+            "nbr_samples": len(members),
+            "first_sample_token": sample_token(0),
+            "last_sample_token": sample_token(len(members) - 1),
+            "name": f"scene-{drive:04d}",
+            "description": f"Simulated street: {members[0]['street']}",
+        }
+    )
     for k, part in enumerate(members):
-        tables["sample"].append({"token": sample_token(k), "timestamp": part["timestamp"], "prev": sample_token(k - 1), "next": sample_token(k + 1), "scene_token": scene})
+        tables["sample"].append(
+            {
+                "token": sample_token(k),
+                "timestamp": part["timestamp"],
+                "prev": sample_token(k - 1),
+                "next": sample_token(k + 1),
+                "scene_token": scene,
+            }
+        )
         for channel, filename in part["files"].items():
             width, height = part["sizes"].get(channel, (0, 0))
-            tables["sample_data"].append({
-                "token": data_token(k, channel), "sample_token": sample_token(k), "ego_pose_token": data_token(k, channel),
-                "calibrated_sensor_token": token(seed, "calibration", channel), "timestamp": part["timestamp"],
-                "fileformat": "pcd" if channel == "LIDAR_TOP" else "jpg", "is_key_frame": True, "height": height, "width": width,
-                "filename": filename, "prev": data_token(k - 1, channel), "next": data_token(k + 1, channel),
-            })
+            tables["sample_data"].append(
+                {
+                    "token": data_token(k, channel),
+                    "sample_token": sample_token(k),
+                    "ego_pose_token": data_token(k, channel),
+                    "calibrated_sensor_token": token(seed, "calibration", channel),
+                    "timestamp": part["timestamp"],
+                    "fileformat": "pcd" if channel == "LIDAR_TOP" else "jpg",
+                    "is_key_frame": True,
+                    "height": height,
+                    "width": width,
+                    "filename": filename,
+                    "prev": data_token(k - 1, channel),
+                    "next": data_token(k + 1, channel),
+                }
+            )
             tables["ego_pose"].append({"token": data_token(k, channel), "timestamp": part["timestamp"], **part["pose"]})
     _annotation_tables(tables, seed, drive, members, [sample_token(k) for k in range(len(members))])
 
 
-def _annotation_tables(tables: dict[str, list[dict[str, Any]]], seed: int, drive: int, members: list[dict[str, Any]], samples: list[str]) -> None:
+def _annotation_tables(
+    tables: dict[str, list[dict[str, Any]]], seed: int, drive: int, members: list[dict[str, Any]], samples: list[str]
+) -> None:
     """Append instances and annotations of one drive, linked along each track."""
     tracks: dict[int, list[tuple[int, dict[str, Any]]]] = {}
     for k, part in enumerate(members):
@@ -189,16 +270,29 @@ def _annotation_tables(tables: dict[str, list[dict[str, Any]]], seed: int, drive
     for id, seen in sorted(tracks.items()):
         tokens = [token(seed, "annotation", drive, members[k]["number"], id) for k, _ in seen]
         instance = token(seed, "instance", drive, id)
-        tables["instance"].append({
-            "token": instance, "category_token": token("category", CATEGORIES[seen[0][1]["class"]]), "nbr_annotations": len(seen),
-            "first_annotation_token": tokens[0], "last_annotation_token": tokens[-1],
-        })
+        tables["instance"].append(
+            {
+                "token": instance,
+                "category_token": token("category", CATEGORIES[seen[0][1]["class"]]),
+                "nbr_annotations": len(seen),
+                "first_annotation_token": tokens[0],
+                "last_annotation_token": tokens[-1],
+            }
+        )
         for n, (k, item) in enumerate(seen):
-            tables["sample_annotation"].append({
-                "token": tokens[n], "sample_token": samples[k], "instance_token": instance, "visibility_token": item["visibility"],
-                "attribute_tokens": [token("attribute", item["attribute"])] if item["attribute"] else [],
-                "translation": item["translation"], "size": item["size"], "rotation": item["rotation"],
-                "prev": tokens[n - 1] if n else "", "next": tokens[n + 1] if n + 1 < len(tokens) else "",
-                "num_lidar_pts": item["points"], "num_radar_pts": 0,
-            })
-
+            tables["sample_annotation"].append(
+                {
+                    "token": tokens[n],
+                    "sample_token": samples[k],
+                    "instance_token": instance,
+                    "visibility_token": item["visibility"],
+                    "attribute_tokens": [token("attribute", item["attribute"])] if item["attribute"] else [],
+                    "translation": item["translation"],
+                    "size": item["size"],
+                    "rotation": item["rotation"],
+                    "prev": tokens[n - 1] if n else "",
+                    "next": tokens[n + 1] if n + 1 < len(tokens) else "",
+                    "num_lidar_pts": item["points"],
+                    "num_radar_pts": 0,
+                }
+            )

@@ -12,7 +12,7 @@ _OFFSETS = tuple(int(v) for v in LEVEL_OFFSET)
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _hash(a, b):
+def _hash(a, b):  # type: ignore[no-untyped-def]
     """A number in [0, 1) for a pair of integers."""
     h = (a * 374761393 + b * 668265263) & 0xFFFFFFFF
     h = ((h ^ (h >> 13)) * 1274126177) & 0xFFFFFFFF
@@ -20,9 +20,9 @@ def _hash(a, b):
 
 
 @njit(cache=True, nogil=True)
-def value_noise(x, y):
+def value_noise(x, y):  # type: ignore[no-untyped-def]
     """Smooth noise in [0, 1) with cells of size 1."""
-    ix, iy = int(math.floor(x)), int(math.floor(y))
+    ix, iy = math.floor(x), math.floor(y)
     fx, fy = x - ix, y - iy
     fx, fy = fx * fx * (3 - 2 * fx), fy * fy * (3 - 2 * fy)
     low = _hash(ix, iy) * (1 - fx) + _hash(ix + 1, iy) * fx
@@ -31,7 +31,7 @@ def value_noise(x, y):
 
 
 @njit(cache=True, nogil=True)
-def sample(textures, texture, x, y, texels, albedo):
+def sample(textures, texture, x, y, texels, albedo):  # type: ignore[no-untyped-def]
     """Multiply ``albedo`` by a texture at tile coordinates; ``texels`` is the width of the pixel on the texture."""
     level = 0
     while texels > 1.42 and level < LEVELS - 1:
@@ -39,7 +39,7 @@ def sample(textures, texture, x, y, texels, albedo):
         level += 1
     size = SIZE >> level
     gx, gy = x * size - 0.5, y * size - 0.5
-    ix, iy = int(math.floor(gx)), int(math.floor(gy))
+    ix, iy = math.floor(gx), math.floor(gy)
     fx, fy = gx - ix, gy - iy
     xa, xb = ix & (size - 1), (ix + 1) & (size - 1)
     ya, yb = (iy & (size - 1)) * size, ((iy + 1) & (size - 1)) * size
@@ -52,14 +52,14 @@ def sample(textures, texture, x, y, texels, albedo):
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _band(x, half, blur):
+def _band(x, half, blur):  # type: ignore[no-untyped-def]
     """Coverage of a line of half width ``half`` at distance ``x``, seen with a pixel ``blur`` wide."""
     edge = max(blur, 0.01)
     return min(max((half - x) / edge + 0.5, 0.0), 1.0) * min(1.0, 2 * half / edge)
 
 
 @njit(cache=True, nogil=True)
-def road_mark(s, t, road, blur):
+def road_mark(s, t, road, blur):  # type: ignore[no-untyped-def]
     """Share of paint, 0 to 1, at arc length ``s`` and offset ``t`` of the road described by ``road``.
 
     See `Site.markings` for the numbers in ``road``.
@@ -72,8 +72,14 @@ def road_mark(s, t, road, blur):
     for k in range(3):
         gap = abs(s - road[6 + 2 * k])
         if gap < road[7 + 2 * k] + 3.0:
-            if abs(gap - road[7 + 2 * k] - 2.6) < 0.25 and ((s < road[6 + 2 * k] and t < -0.15 and t > -half + road[5]) or (
-                    s > road[6 + 2 * k] and t > 0.15 and t < half - road[5])) and road[1] > 0:
+            if (
+                abs(gap - road[7 + 2 * k] - 2.6) < 0.25
+                and (
+                    (s < road[6 + 2 * k] and t < -0.15 and t > -half + road[5])
+                    or (s > road[6 + 2 * k] and t > 0.15 and t < half - road[5])
+                )
+                and road[1] > 0
+            ):
                 return 0.9
             return 0.0
     if abs(zebra) < 4.0:
@@ -94,13 +100,13 @@ def road_mark(s, t, road, blur):
 
 
 @njit(cache=True, nogil=True)
-def facade(x, y, seed, blur, night, albedo):
+def facade(x, y, seed, blur, night, albedo):  # type: ignore[no-untyped-def]
     """Windows, doors and shops on a wall whose cells are one unit wide and high; changes ``albedo`` in place.
 
     Returns how far the point is window glass (0 to 1), or minus the brightness of a lit window at night.
     """
     number = int(seed * 9973)
-    column, floor = int(math.floor(x)), int(math.floor(y))
+    column, floor = math.floor(x), math.floor(y)
     fx, fy = x - column, y - floor
     wide = 0.19 + 0.10 * _hash(number, 3)
     low, high = 0.26 + 0.08 * _hash(number, 5), 0.80 + 0.08 * _hash(number, 7)
@@ -135,7 +141,8 @@ def facade(x, y, seed, blur, night, albedo):
         albedo[1] = albedo[1] * (1 - soft) + shade * 0.9 * panel * soft
         albedo[2] = albedo[2] * (1 - soft) + shade * 0.7 * panel * soft
         return 0.0
-    frame = 1.0 if inside < 0.035 or (dx < 0.014 and not shop) else 0.0
+    bar = dx < 0.014 or (shop and (abs(dx - 0.22) < 0.012 or abs(fy - 0.62) < 0.014))
+    frame = 1.0 if inside < 0.035 or bar else 0.0
     frame *= soft * min(1.0, 0.04 / max(blur, 0.04))
     light = _hash(number + 7 * column, 37 + floor)
     curtain = 0.0
@@ -145,6 +152,8 @@ def facade(x, y, seed, blur, night, albedo):
         if light > 0.85 and fy > high - 0.5 * (high - low):
             curtain = 0.5
     reveal = 0.5 if high - fy < 0.06 else 1.0
+    if shop:  # something dim on display, darker towards the ceiling
+        curtain = 0.22 * value_noise(x * 6.0 + seed * 50.0, y * 9.0) * max(0.62 - fy, 0.0) / 0.5
     glass = (0.012 + 0.03 * _hash(number + column, 43 + floor)) * reveal + 0.30 * curtain * reveal
     for k in range(3):
         pane = glass * (1 - frame) + 0.55 * frame

@@ -72,7 +72,13 @@ class Preset:
             raise ConfigError(f"the image scale must lie above 0 and at most 1, got {factor:g}")
         scale = np.diag([factor, factor, 1.0])
         cameras = tuple(
-            Camera(c.name, scale @ c.projection, c.camera_from_lidar, max(8, round(c.width * factor)), max(8, round(c.height * factor)))
+            Camera(
+                c.name,
+                scale @ c.projection,
+                c.camera_from_lidar,
+                max(8, round(c.width * factor)),
+                max(8, round(c.height * factor)),
+            )
             for c in self.cameras
         )
         return replace(self, cameras=cameras, lidar=replace(self.lidar, steps=steps or self.lidar.steps))
@@ -80,14 +86,21 @@ class Preset:
 
 HDL64: Final = LidarSpec(
     tuple(np.round(np.concatenate([np.linspace(-23.7, -8.4, 32), np.linspace(-7.9, 2.5, 32)]), 3).tolist()),
-    2083, 10.0, 80.0, 1.5, 0.02, 1.73, 4500.0, 0.015,
+    2083,
+    10.0,
+    80.0,
+    1.5,
+    0.02,
+    1.73,
+    6000.0,
+    0.015,
 )
 """A 64-beam scanner; beam elevations measured as the medians over 32 scans of KITTI (0.335 and 0.494 degrees apart)."""
 HDL32: Final = LidarSpec(
-    tuple(np.round(np.linspace(-30.67, 10.67, 32), 3).tolist()), 1084, 20.0, 100.0, 1.0, 0.02, 1.84, 4500.0, 0.02
+    tuple(np.round(np.linspace(-30.67, 10.67, 32), 3).tolist()), 1084, 20.0, 100.0, 1.0, 0.02, 1.84, 6000.0, 0.02
 )
 """A 32-beam scanner with the published elevations of nuScenes' sensor."""
-VLP16: Final = LidarSpec(tuple(np.linspace(-15.0, 15.0, 16).tolist()), 1800, 10.0, 100.0, 0.5, 0.03, 1.73, 4500.0, 0.02)
+VLP16: Final = LidarSpec(tuple(np.linspace(-15.0, 15.0, 16).tolist()), 1800, 10.0, 100.0, 0.5, 0.03, 1.73, 6000.0, 0.02)
 """A 16-beam scanner, two degrees between beams."""
 
 KITTI_FOCAL: Final = 721.5377
@@ -101,8 +114,9 @@ KITTI_OFFSETS: Final = (0.0, -387.5744, 44.85728, -339.5242)
 def kitti_calibration() -> dict[str, Matrix]:
     """P0 to P3 (3, 4), R0_rect (3, 3), Tr_velo_to_cam (3, 4), Tr_imu_to_velo (3, 4).
 
-    Focal length, image centre and baseline are KITTI's. The rotations are ours: R0_rect is a small rotation, and together with
-    Tr_velo_to_cam it turns the LiDAR's axes exactly (but for a small yaw), so that a box upright for one is upright for the other.
+    Focal length, image centre and baseline are KITTI's. The rotations are ours: R0_rect is a small rotation,
+    and together with Tr_velo_to_cam it turns the LiDAR's axes exactly (but for a small yaw): a box upright for one is
+    upright for the other.
     """
     result: dict[str, Matrix] = {}
     for number, offset in enumerate(KITTI_OFFSETS):
@@ -110,12 +124,16 @@ def kitti_calibration() -> dict[str, Matrix]:
         result[f"P{number}"] = p
     rectify = _rotation((0.0043, -0.0075, -0.0098))
     yaw = 0.0072
-    axes = np.array([[0, -1, 0], [0, 0, -1], [1, 0, 0.0]]) @ np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
+    axes = np.array([[0, -1, 0], [0, 0, -1], [1, 0, 0.0]]) @ np.array(
+        [[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]]
+    )
     rotation = rectify.T @ axes
     translation = rectify.T @ np.array([-0.004, -0.076, -0.272])
     result["R0_rect"] = rectify
     result["Tr_velo_to_cam"] = np.concatenate([rotation, translation[:, None]], axis=1)
-    result["Tr_imu_to_velo"] = np.concatenate([_rotation((0.0148, 0.002, -0.0008)), np.array([[-0.81], [0.32], [-0.80]])], axis=1)
+    result["Tr_imu_to_velo"] = np.concatenate(
+        [_rotation((0.0148, 0.002, -0.0008)), np.array([[-0.81], [0.32], [-0.80]])], axis=1
+    )
     return result
 
 
@@ -143,7 +161,7 @@ def _kitti_cameras() -> tuple[Camera, ...]:
 
 
 NUSCENES_LIDAR: Final = ((0.943713, 0.0, 1.84023), -1.5687)
-"""Position of LIDAR_TOP on the car, and its yaw: the raw sensor frame has x to the right and y ahead, as the real one."""
+"""Position of LIDAR_TOP on the car, and its yaw: the raw frame has x to the right and y ahead, as the real one."""
 NUSCENES_CAMERAS: Final = (
     ("CAM_FRONT", (1.722, 0.005, 1.495), 0.0, (1252.8, 826.6, 470.0)),
     ("CAM_FRONT_RIGHT", (1.581, -0.499, 1.517), -56.4, (1256.7, 817.8, 452.0)),
@@ -191,11 +209,28 @@ def _nuscenes_cameras() -> tuple[Camera, ...]:
 
 
 @lru_cache(maxsize=1)
-def presets() -> dict[str, Preset]:
+def all_presets() -> dict[str, Preset]:
     """All presets by name."""
-    kitti = Preset("kitti64", "kitti", HDL64, _kitti_cameras(), 0.0, False, 10.0, "64-beam LiDAR and rectified stereo pair, KITTI layout")
-    nuscenes = Preset("nuscenes32", "nuscenes", HDL32, _nuscenes_cameras(), 0.0, False, 2.0,
-                      "32-beam LiDAR and six cameras, nuScenes layout")
+    kitti = Preset(
+        "kitti64",
+        "kitti",
+        HDL64,
+        _kitti_cameras(),
+        0.0,
+        False,
+        10.0,
+        "64-beam LiDAR and rectified stereo pair, KITTI layout",
+    )
+    nuscenes = Preset(
+        "nuscenes32",
+        "nuscenes",
+        HDL32,
+        _nuscenes_cameras(),
+        0.0,
+        False,
+        2.0,
+        "32-beam LiDAR and six cameras, nuScenes layout",
+    )
     every = (
         kitti,
         nuscenes,
@@ -212,7 +247,7 @@ def get_preset(name: str) -> Preset:
     Raises:
         ConfigError: there is none.
     """
-    table = presets()
+    table = all_presets()
     if name not in table:
         raise ConfigError(f"unknown preset {name!r}; use one of {', '.join(table)}")
     return table[name]

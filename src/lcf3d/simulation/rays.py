@@ -57,7 +57,9 @@ class RayTracer:
         found = self._scene.run(o, d, query="INTERSECT", output=1)
         return Hits(found["primID"], found["tfar"], found["u"], found["v"])
 
-    def is_blocked(self, origins: NDArray[np.floating], directions: NDArray[np.floating], reach_m: float = 1e4) -> NDArray[np.bool_]:
+    def is_blocked(
+        self, origins: NDArray[np.floating], directions: NDArray[np.floating], reach_m: float = 1e4
+    ) -> NDArray[np.bool_]:
         """(N,) whether anything lies within ``reach_m`` along the rays."""
         o, d = _rays(origins, directions)
         if not len(o):

@@ -40,7 +40,9 @@ class Path:
         curvature: 1 / m, constant between 0 and ``last``; straight before.
     """
 
-    def __init__(self, start: tuple[float, float], heading: float, first: float, last: float, curvature: float = 0.0) -> None:
+    def __init__(
+        self, start: tuple[float, float], heading: float, first: float, last: float, curvature: float = 0.0
+    ) -> None:
         self.first, self.last = first, last
         self._s = np.arange(np.floor(first), np.ceil(last) + 1.0)
         bend = curvature * np.clip((self._s - 5) / 25, 0, 1)
@@ -48,8 +50,9 @@ class Path:
         self._x = start[0] + np.concatenate([[0], np.cumsum(np.cos((self._heading[:-1] + self._heading[1:]) / 2))])
         self._y = start[1] + np.concatenate([[0], np.cumsum(np.sin((self._heading[:-1] + self._heading[1:]) / 2))])
 
-    def at(self, s: ArrayLike, offset: ArrayLike = 0.0) -> tuple[Floats, Floats, Floats]:
+    def at(self, s: float | Floats, offset: float | Floats = 0.0) -> tuple[Floats, Floats, Floats]:
         """World x, y and heading at arc length ``s``, ``offset`` metres to the left."""
+        s = np.asarray(s, dtype=np.float64)
         heading = np.interp(s, self._s, self._heading)
         x = np.interp(s, self._s, self._x) - np.sin(heading) * offset
         y = np.interp(s, self._s, self._y) + np.cos(heading) * offset
@@ -67,8 +70,16 @@ class Path:
         return [(a, b) for a, b in result if b - a > 0.05]
 
 
-def strip(path: Path, terrain: Terrain, stretch: tuple[float, float], across: tuple[float, ...], lift: tuple[float, ...],
-          material: str, colour: tuple[float, float, float], step: float = 4.0) -> Mesh:
+def strip(
+    path: Path,
+    terrain: Terrain,
+    stretch: tuple[float, float],
+    across: tuple[float, ...],
+    lift: tuple[float, ...],
+    material: str,
+    colour: tuple[float, float, float],
+    step: float = 4.0,
+) -> Mesh:
     """A surface along a path: ``across`` are offsets to the left, ``lift`` the heights of those above the terrain.
 
     uv is (arc length, offset) in metres.
@@ -83,8 +94,14 @@ def strip(path: Path, terrain: Terrain, stretch: tuple[float, float], across: tu
     return grid(np.stack(columns, axis=1), material, colour, crease=0.6, uv=np.stack(uv, axis=1))
 
 
-def open_ground(terrain: Terrain, centre: tuple[float, float], extent: float, material: str,
-                colour: tuple[float, float, float], lower: float) -> Mesh:
+def open_ground(
+    terrain: Terrain,
+    centre: tuple[float, float],
+    extent: float,
+    material: str,
+    colour: tuple[float, float, float],
+    lower: float,
+) -> Mesh:
     """The land below and around everything, fine near ``centre`` and coarse far away."""
     near = np.linspace(-1, 1, 41)
     axis = np.sign(near) * np.abs(near) ** 1.6 * extent

@@ -4,13 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lcf3d.errors import ConfigError
+from lcf3d.geometry.boxes import bev_corners
 from lcf3d.simulation.actors import Actor, Motion
+from lcf3d.simulation.materials import MATERIAL_ID
 from lcf3d.simulation.meshes.primitives import Mesh
+from lcf3d.simulation.obstacles import ObstacleMap
+from lcf3d.simulation.rays import RayTracer
 from lcf3d.simulation.roads import Path, Terrain
 from lcf3d.simulation.scenery import Site, build_scenery
 from lcf3d.simulation.streets import STREET_NAMES, STREETS
@@ -56,14 +61,36 @@ class Scene:
 
     def at(self, time: float) -> Snapshot:
         """The scene ``time`` seconds into the drive."""
-        meshes = [actor.mesh(time, self.site.terrain) for actor in self.actors]
+        heights = self.ground_below(time)
+        meshes = [actor.mesh(time, z) for actor, z in zip(self.actors, heights.tolist(), strict=True)]
         owner = [np.zeros(len(self.static), dtype=np.int32)]
         owner += [np.full(len(m), a.id, dtype=np.int32) for a, m in zip(self.actors, meshes, strict=True)]
         return Snapshot(Mesh.join([self.static, *meshes]), np.concatenate(owner))
 
     def boxes(self, time: float) -> NDArray[np.float64]:
         """(A, 7) world boxes of the actors."""
-        return np.array([a.box(time, self.site.terrain) for a in self.actors], dtype=np.float64).reshape(-1, 7)
+        heights = self.ground_below(time).tolist()
+        boxes = [a.box(time, z) for a, z in zip(self.actors, heights, strict=True)]
+        return np.array(boxes, dtype=np.float64).reshape(-1, 7)
+
+    def ground_below(self, time: float) -> NDArray[np.float64]:
+        """(A,) world height on which each actor stands: the highest ground below its centre and corners."""
+        flat = np.array([a.box(time, 0.0) for a in self.actors], dtype=np.float64).reshape(-1, 7)
+        corners = bev_corners(flat)
+        points = np.concatenate([corners, flat[:, None, :2]], axis=1).reshape(-1, 2)
+        origins = np.concatenate([points, np.full((len(points), 1), 20.0)], axis=1)
+        if not len(points):
+            return np.zeros(0)
+        hits = self._ground.first_hits(origins, np.broadcast_to([0.0, 0.0, -1.0], origins.shape))
+        heights = np.where(hits.triangle >= 0, 20.0 - hits.distance, self.site.terrain.height(*points.T))
+        result: NDArray[np.float64] = heights.reshape(-1, 5).max(axis=1)
+        return result
+
+    @cached_property
+    def _ground(self) -> RayTracer:
+        """Rays onto roads, pavements and grass alone."""
+        kinds = [MATERIAL_ID[name] for name in ("asphalt", "side_asphalt", "pavement", "cobbles", "grass", "earth")]
+        return RayTracer(self.static.corners[np.isin(self.static.material, kinds)])
 
     def with_actors(self, actors: Sequence[Actor]) -> Scene:
         """The same street with other road users."""
@@ -91,8 +118,8 @@ def build_scene(
     """
     if street is not None and street not in STREET_NAMES:
         raise ConfigError(f"unknown street {street!r}; use one of {', '.join(STREET_NAMES)}")
-    if not 0 < density <= 20:
-        raise ConfigError(f"density must lie above 0 and at most 20, got {density:g}")
+    if not 0 < density <= 100:
+        raise ConfigError(f"density must lie above 0 and at most 100, got {density:g}")
     shares = np.array([s.share for s in STREETS])
     drawn = int(rng.choice(len(STREETS), p=shares / shares.sum()))
     kind = STREETS[drawn if street is None else STREET_NAMES.index(street)]
@@ -108,18 +135,24 @@ def build_scene(
     site = Site(kind, path, terrain, first, last, speed * duration, crossings, sides)
     ego = Motion(path, 0.0, -lane, speed)
     static = build_scenery(site, rng)
-    actors = populate(site, ego, dataset, duration, density, rng)
+    x, y, _ = path.at(np.array([first, 0.0, last / 2, last]))
+    reach = 60.0
+    obstacles = ObstacleMap(static, terrain, (x.min() - reach, y.min() - reach), (x.max() + reach, y.max() + reach))
+    actors = populate(site, obstacles, ego, dataset, duration, density, rng)
     cloudiness = float(np.clip(rng.beta(1.1, 1.6), 0, 1))
     azimuth, elevation = rng.uniform(-np.pi, np.pi), np.radians(rng.uniform(24, 58))
     sun = np.array([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)])
-    return Scene(site, static, tuple(actors), ego, sun, cloudiness, float(rng.uniform(350, 1400)), int(rng.integers(2**31)))
+    return Scene(
+        site, static, tuple(actors), ego, sun, cloudiness, float(rng.uniform(350, 1400)), int(rng.integers(2**31))
+    )
 
 
 def _crossings(
     path: Path, chance: float, half_width: float, last: float, rng: np.random.Generator
 ) -> tuple[tuple[tuple[float, float], ...], tuple[Path, ...]]:
     """Side streets: where, how wide, and their centre lines to both sides."""
-    places, sides = [], []
+    places: list[tuple[float, float]] = []
+    sides: list[Path] = []
     s = float(rng.uniform(14, 60))
     while s < last - 15 and len(places) < 3:
         if rng.random() < chance:

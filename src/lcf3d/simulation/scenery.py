@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Final
 
 import numpy as np
@@ -12,17 +11,11 @@ from numpy.typing import NDArray
 from lcf3d.simulation.meshes import street as build
 from lcf3d.simulation.meshes.primitives import Mesh
 from lcf3d.simulation.roads import Path, Terrain, open_ground, skyline, strip
+from lcf3d.simulation.roadside import BRICKS, ROOFS, WALLS, any_of, template
 from lcf3d.simulation.streets import StreetType
 
 Colour = tuple[float, float, float]
 
-GREENS: Final[tuple[Colour, ...]] = ((0.07, 0.13, 0.03), (0.09, 0.15, 0.035), (0.06, 0.11, 0.035), (0.12, 0.15, 0.03), (0.19, 0.14, 0.03))
-WALLS: Final[tuple[Colour, ...]] = (
-    (0.62, 0.59, 0.52), (0.66, 0.64, 0.60), (0.55, 0.46, 0.30), (0.60, 0.53, 0.38), (0.45, 0.36, 0.28), (0.52, 0.50, 0.47),
-    (0.58, 0.40, 0.30), (0.42, 0.45, 0.46),
-)
-BRICKS: Final[tuple[Colour, ...]] = ((0.34, 0.15, 0.10), (0.42, 0.24, 0.15), (0.28, 0.13, 0.10))
-ROOFS: Final[tuple[Colour, ...]] = ((0.26, 0.10, 0.06), (0.20, 0.085, 0.055), (0.10, 0.09, 0.09), (0.30, 0.13, 0.07))
 KERB: Final = 0.12
 """Height of the pavement above the road in metres."""
 
@@ -119,47 +112,9 @@ def build_scenery(site: Site, rng: np.random.Generator) -> Mesh:
     return Mesh.join(parts)
 
 
-_VARIANTS: Final = {"tree": 8, "fine_tree": 8, "conifer": 4, "bush": 8, "hedge": 4, "undergrowth": 8, "fine_undergrowth": 8, "fence": 2, "bollard": 1, "lamp": 2, "bin": 1,
-                    "bench": 1, "shelter": 1, "delineator": 1, "rail": 1, "light": 1, "sign": 4}
-
-
-@lru_cache(maxsize=64)
-def _template(kind: str, variant: int) -> Mesh:
-    """One of ``_VARIANTS`` ready-made things, made when first used; plants and fences are stretched where they are put."""
-    rng = np.random.default_rng(7000 + variant)
-    if kind == "tree":
-        return build.tree(8.5, 8.5 * float(rng.uniform(0.5, 0.7)), GREENS[variant % 5], 120, 0.32, rng)
-    if kind == "fine_tree":
-        return build.tree(8.5, 8.5 * float(rng.uniform(0.5, 0.7)), GREENS[variant % 5], 700, 0.115, rng)
-    if kind == "conifer":
-        return build.conifer(9.5, 3.8, (0.035, 0.065, 0.03), 300, rng)
-    if kind == "bush":
-        return build.bush(1.3, 1.2, 1.2, GREENS[variant % 5], 620, rng)
-    if kind == "hedge":
-        return build.hedge(5.0, 1.3, GREENS[variant], rng)
-    if kind == "undergrowth":
-        return build.undergrowth(4.4, 5.0, float(rng.uniform(0.9, 2.6)), 450, 0.28, GREENS[variant % 5], rng)
-    if kind == "fine_undergrowth":
-        return build.undergrowth(4.4, 5.0, float(rng.uniform(0.9, 2.6)), 1900, 0.13, GREENS[variant % 5], rng)
-    if kind == "fence":
-        return build.fence(5.0, 1.1, variant == 1)
-    if kind == "lamp":
-        return build.street_lamp(6.0 + 2.0 * variant, 1.2)
-    if kind == "sign":
-        return build.sign_post(variant)
-    if kind == "rail":
-        return build.guard_rail(4.02)
-    makers = {"bollard": build.bollard, "bin": build.litter_bin, "bench": build.bench, "shelter": build.bus_shelter,
-              "delineator": build.delineator, "light": build.traffic_light}
-    return makers[kind]()
-
-
-def _any(kind: str, rng: np.random.Generator) -> Mesh:
-    """A template of a kind, chosen at random."""
-    return _template(kind, int(rng.integers(_VARIANTS[kind])))
-
-
-def _place(site: Site, mesh: Mesh, s: float, offset: float, side: float, lift: float = 0.0, path: Path | None = None) -> Mesh:
+def _place(
+    site: Site, mesh: Mesh, s: float, offset: float, side: float, lift: float = 0.0, path: Path | None = None
+) -> Mesh:
     """A mesh whose front looks towards -y put beside the road so that it faces it."""
     x, y, heading = (path or site.path).at(s, offset * side)
     yaw = float(heading) + (0.0 if side > 0 else np.pi)
@@ -170,7 +125,10 @@ def _ground(site: Site, rng: np.random.Generator) -> list[Mesh]:
     x, y, _ = site.path.at((site.first + site.last) / 2)
     centre = (float(x), float(y))
     green = np.array([0.080, 0.100, 0.038]) * rng.uniform(0.85, 1.2)
-    return [open_ground(site.terrain, centre, 460.0, "grass", (green[0], green[1], green[2]), 0.06), skyline(centre, rng)]
+    return [
+        open_ground(site.terrain, centre, 460.0, "grass", (green[0], green[1], green[2]), 0.06),
+        skyline(centre, rng),
+    ]
 
 
 def _surfaces(site: Site) -> list[Mesh]:
@@ -185,13 +143,25 @@ def _surfaces(site: Site) -> list[Mesh]:
     outer = w + street.pavement
     for side in (1.0, -1.0):
         for a, b in site.path.pieces(*whole, site.gaps):
-            def along(across: tuple[float, ...], lift: tuple[float, ...], material: str, colour: Colour,
-                      a: float = a, b: float = b, side: float = side) -> Mesh:
+
+            def along(
+                across: tuple[float, ...],
+                lift: tuple[float, ...],
+                material: str,
+                colour: Colour,
+                a: float = a,
+                b: float = b,
+                side: float = side,
+            ) -> Mesh:
                 return strip(site.path, site.terrain, (a, b), tuple(t * side for t in across), lift, material, colour)
 
             if street.pavement:
                 parts.append(along((w, w, w + 0.15), (-0.03, KERB, KERB), "kerb", (0.33, 0.32, 0.31)))
-                parts.append(along((w + 0.15, outer), (KERB, KERB), "cobbles" if street.paving == "cobbles" else "pavement", slab))
+                parts.append(
+                    along(
+                        (w + 0.15, outer), (KERB, KERB), "cobbles" if street.paving == "cobbles" else "pavement", slab
+                    )
+                )
             far = site.building_line if street.buildings != "woods" else w + street.verge
             if far > outer + 0.05 or street.verge:
                 garden = (0.072, 0.092, 0.034)
@@ -218,18 +188,38 @@ def _kerb_end(site: Site, s: float, inner: float, outer: float, lift: float) -> 
 def _side_street(site: Site, path: Path, half: float, rng: np.random.Generator) -> list[Mesh]:
     """A side street from the edge of the main one, with pavements and a row of buildings."""
     start, stop = site.street.half_width - 1.0, path.last
-    parts = [strip(path, site.terrain, (start, stop), (-half, 0.0, half), (-0.005,) * 3, "side_asphalt", (0.12, 0.12, 0.122))]
+    parts = [
+        strip(path, site.terrain, (start, stop), (-half, 0.0, half), (-0.005,) * 3, "side_asphalt", (0.12, 0.12, 0.122))
+    ]
     pavement = 1.8 if site.street.pavement else 0.0
     begin = site.street.half_width + 0.15
     for side in (1.0, -1.0):
         if pavement:
-            parts.append(strip(path, site.terrain, (begin, stop), tuple(side * t for t in (half, half, half + pavement)),
-                               (-0.03, KERB, KERB), "pavement", (0.25, 0.245, 0.235)))
+            parts.append(
+                strip(
+                    path,
+                    site.terrain,
+                    (begin, stop),
+                    tuple(side * t for t in (half, half, half + pavement)),
+                    (-0.03, KERB, KERB),
+                    "pavement",
+                    (0.25, 0.245, 0.235),
+                )
+            )
         if site.street.buildings in ("houses", "blocks"):
             s = site.building_line + 18.0
             while s < stop - 10:
                 width = float(rng.uniform(10, 16))
-                parts.append(_place(site, _building(site, width, rng), s + width / 2, half + pavement + (3.0 if site.street.buildings == "houses" else 0.3), side, path=path))
+                parts.append(
+                    _place(
+                        site,
+                        _building(site, width, rng),
+                        s + width / 2,
+                        half + pavement + (3.0 if site.street.buildings == "houses" else 0.3),
+                        side,
+                        path=path,
+                    )
+                )
                 s += width + (float(rng.uniform(3, 8)) if site.street.buildings == "houses" else 0.0)
     return parts
 
@@ -250,7 +240,12 @@ def _beside(site: Site, side: float, rng: np.random.Generator) -> list[Mesh]:
     """Everything that stands along one side of the main street."""
     if site.street.buildings == "woods":
         return _woods(site, side, rng)
-    return _buildings(site, side, rng) + _street_trees(site, side, rng) + _furniture(site, side, rng)
+    return [
+        *_buildings(site, side, rng),
+        *_background(site, side, rng),
+        *_street_trees(site, side, rng),
+        *_furniture(site, side, rng),
+    ]
 
 
 def _buildings(site: Site, side: float, rng: np.random.Generator) -> list[Mesh]:
@@ -265,12 +260,37 @@ def _buildings(site: Site, side: float, rng: np.random.Generator) -> list[Mesh]:
             gap = float(rng.uniform(8, 45))
         middle = s + width / 2
         if not site.near_crossing(middle, width / 2 + 2.0):
-            parts.append(_place(site, _building(site, width, rng), middle, site.building_line + (float(rng.uniform(0, 3)) if not blocks else 0.0), side))
+            parts.append(
+                _place(
+                    site,
+                    _building(site, width, rng),
+                    middle,
+                    site.building_line + (float(rng.uniform(0, 3)) if not blocks else 0.0),
+                    side,
+                )
+            )
             if street.buildings == "houses":
                 parts += _front_garden(site, side, s - gap / 2, s + width + gap / 2, rng)
         elif street.buildings == "few" and not site.near_crossing(middle, 8):
             parts += _front_garden(site, side, s, s + width, rng)
         s += width + gap
+    return parts
+
+
+def _background(site: Site, side: float, rng: np.random.Generator) -> list[Mesh]:
+    """Houses and trees behind the first row, seen through the gaps."""
+    parts = []
+    s = site.first
+    while s < site.last:
+        s += float(rng.uniform(7, 16))
+        if site.near_crossing(s, 12.0):
+            continue
+        offset = site.building_line + float(rng.uniform(22, 60))
+        if rng.random() < 0.35:
+            parts.append(_place(site, _building(site, float(rng.uniform(9, 15)), rng), s, offset, side))
+        else:
+            mesh = any_of("tree", rng).scaled(float(rng.uniform(0.9, 1.5)) * np.ones(3))
+            parts.append(_place(site, mesh, s, offset, side))
     return parts
 
 
@@ -285,9 +305,9 @@ def _front_garden(site: Site, side: float, first: float, last: float, rng: np.ra
         if b - a < 1.0 or site.near_crossing((a + b) / 2, (b - a) / 2 + 1):
             continue
         if kind == "hedge":
-            piece = _any("hedge", rng).scaled(((b - a) / 5, 1, float(rng.uniform(0.7, 1.35))))
+            piece = any_of("hedge", rng).scaled(((b - a) / 5, 1, float(rng.uniform(0.7, 1.35))))
         elif kind == "fence":
-            piece = _any("fence", rng).scaled(((b - a) / 5, 1, float(rng.uniform(0.85, 1.2))))
+            piece = any_of("fence", rng).scaled(((b - a) / 5, 1, float(rng.uniform(0.85, 1.2))))
         elif kind == "wall":
             piece = build.garden_wall(b - a, float(rng.uniform(0.5, 1.3)), bool(rng.random() < 0.4))
         else:
@@ -296,8 +316,10 @@ def _front_garden(site: Site, side: float, first: float, last: float, rng: np.ra
             parts.append(_place(site, piece, (a + b) / 2, edge, side, KERB * 0.8))
         for _ in range(int(rng.integers(1, 4))):
             size = rng.uniform(0.7, 1.8)
-            bush = _any("bush", rng).scaled(np.array([1.0, 1.0, rng.uniform(0.7, 1.2)]) * size / 1.2)
-            parts.append(_place(site, bush, float(rng.uniform(a, b)), edge + float(rng.uniform(0.9, 2.6)), side, KERB * 0.7))
+            bush = any_of("bush", rng).scaled(np.array([1.0, 1.0, rng.uniform(0.7, 1.2)]) * size / 1.2)
+            parts.append(
+                _place(site, bush, float(rng.uniform(a, b)), edge + float(rng.uniform(0.9, 2.6)), side, KERB * 0.7)
+            )
     if rng.random() < 0.75:
         parts.append(_tree(site, float(rng.uniform(first, last)), edge + float(rng.uniform(1.5, 2.5)), side, rng, 0.7))
     return parts
@@ -305,7 +327,9 @@ def _front_garden(site: Site, side: float, first: float, last: float, rng: np.ra
 
 def _tree(site: Site, s: float, offset: float, side: float, rng: np.random.Generator, scale: float = 1.0) -> Mesh:
     size = float(rng.uniform(0.7, 1.3)) * scale
-    mesh = _any("conifer" if rng.random() < 0.15 else "fine_tree" if site.is_near(s) else "tree", rng).scaled(np.array([1, 1, rng.uniform(0.85, 1.15)]) * size)
+    mesh = any_of("conifer" if rng.random() < 0.15 else "fine_tree" if site.is_near(s) else "tree", rng).scaled(
+        np.array([1, 1, rng.uniform(0.85, 1.15)]) * size
+    )
     mesh = mesh.placed(0, 0, 0, float(rng.uniform(0, 6.28)))
     return _place(site, mesh, s, offset, side, KERB * 0.7)
 
@@ -332,19 +356,22 @@ def _furniture(site: Site, side: float, rng: np.random.Generator) -> list[Mesh]:
     street = site.street
     edge = street.half_width + 0.45
     parts = []
-    lamp = _any("lamp", rng)
+    lamp = any_of("lamp", rng)
     if side > 0 or street.lanes > 1:
         parts += [_place(site, lamp, s, edge, side, KERB) for s in site.lamp_places(side)]
     for s in rng.uniform(site.first, site.last, int(rng.poisson((site.last - site.first) * 0.05))):
         if site.near_crossing(s, 1.0):
             continue
-        pick = rng.choice(["sign", "bin", "bollard", "bench", "shelter", "billboard", "bush"], p=[0.38, 0.14, 0.16, 0.10, 0.04, 0.06, 0.12])
+        pick = rng.choice(
+            ["sign", "bin", "bollard", "bench", "shelter", "billboard", "bush"],
+            p=[0.38, 0.14, 0.16, 0.10, 0.04, 0.06, 0.12],
+        )
         if pick in ("shelter", "bench", "billboard", "bush") and street.pavement + street.verge < 3:
             pick = "sign"
         parts += _furniture_piece(site, str(pick), float(s), side, edge, rng)
     for s, w in site.crossings:
         along = s - w - 1.5 if side < 0 else s + w + 1.5
-        mesh = _template("light", 0) if street.lanes > 1 or rng.random() < 0.25 else _template("sign", 1)
+        mesh = template("light", 0) if street.lanes > 1 or rng.random() < 0.25 else template("sign", 1)
         parts.append(_facing_traffic(site, mesh, along, edge, side))
     return parts
 
@@ -352,47 +379,52 @@ def _furniture(site: Site, side: float, rng: np.random.Generator) -> list[Mesh]:
 def _facing_traffic(site: Site, mesh: Mesh, s: float, offset: float, side: float) -> Mesh:
     """A mesh that looks towards -x put so that the drivers on its side of the road see it."""
     x, y, heading = site.path.at(s, offset * side)
-    return mesh.placed(float(x), float(y), float(site.terrain.height(x, y)) + KERB, float(heading) + (0.0 if side < 0 else np.pi))
+    return mesh.placed(
+        float(x), float(y), float(site.terrain.height(x, y)) + KERB, float(heading) + (0.0 if side < 0 else np.pi)
+    )
 
 
 def _furniture_piece(site: Site, pick: str, s: float, side: float, edge: float, rng: np.random.Generator) -> list[Mesh]:
     if pick == "sign":
-        return [_facing_traffic(site, _any("sign", rng), s, edge, side)]
+        return [_facing_traffic(site, any_of("sign", rng), s, edge, side)]
     if pick == "billboard":
         colour = (float(rng.uniform(0.02, 0.5)), float(rng.uniform(0.02, 0.3)), float(rng.uniform(0.02, 0.4)))
         return [_facing_traffic(site, build.billboard(colour), s, edge + 2.0, side)]
     outer = site.street.half_width + site.street.pavement
     if pick == "bollard":
-        return [_place(site, _template("bollard", 0), s + k * 1.4, edge - 0.05, side, KERB) for k in range(int(rng.integers(2, 6)))]
+        return [
+            _place(site, template("bollard", 0), s + k * 1.4, edge - 0.05, side, KERB)
+            for k in range(int(rng.integers(2, 6)))
+        ]
     if pick == "bench":
-        return [_place(site, _template("bench", 0).placed(0, 0, 0, -np.pi / 2), s, outer - 0.5, side, KERB)]
+        return [_place(site, template("bench", 0).placed(0, 0, 0, -np.pi / 2), s, outer - 0.5, side, KERB)]
     if pick == "shelter":
-        return [_place(site, _template("shelter", 0), s, outer - 1.6, side, KERB)]
+        return [_place(site, template("shelter", 0), s, outer - 1.6, side, KERB)]
     if pick == "bush":
-        return [_place(site, _any("bush", rng), s, outer + 0.3, side, KERB)]
-    return [_place(site, _template("bin", 0), s, edge + 0.1, side, KERB)]
+        return [_place(site, any_of("bush", rng), s, outer + 0.3, side, KERB)]
+    return [_place(site, template("bin", 0), s, edge + 0.1, side, KERB)]
 
 
 def _woods(site: Site, side: float, rng: np.random.Generator) -> list[Mesh]:
     """A country road: fields with single trees, or the edge of a wood; delineators and now and then a guard rail."""
     street = site.street
-    parts = []
+    parts = _background(site, side, rng) if rng.random() < 0.5 else []
     edge = street.half_width + 0.9
     for s in np.arange(site.first, site.last, 25.0):
         if not site.near_crossing(s, 2.0):
-            parts.append(_place(site, _template("delineator", 0), float(s), edge, side))
+            parts.append(_place(site, template("delineator", 0), float(s), edge, side))
     dense = rng.random() < 0.6
     if rng.random() < 0.2:
         a = float(rng.uniform(site.first, site.last - 40))
         for k in range(8):
             if not site.near_crossing(a + 4 * k, 4):
-                parts.append(_place(site, _template("rail", 0), a + 4 * k, edge + 0.5, side))
+                parts.append(_place(site, template("rail", 0), a + 4 * k, edge + 0.5, side))
     wall = street.half_width + street.verge
     for s in np.arange(site.first, site.last, 4.0):
         if site.near_crossing(s, 5.0):
             continue
         if dense:
-            plants = _any("fine_undergrowth" if site.is_near(s) else "undergrowth", rng)
+            plants = any_of("fine_undergrowth" if site.is_near(s) else "undergrowth", rng)
             parts.append(_place(site, plants, float(s), wall + 0.5 + float(rng.uniform(0, 1)), side))
         if rng.random() < (0.75 if dense else 0.06):
             offset = wall + float(rng.uniform(2.0, 7.0)) + (0 if dense else float(rng.uniform(2, 20)))

@@ -15,12 +15,12 @@ _HALF_PI = math.pi / 2
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _sky(sky, x, y, z, out):
+def _sky(sky, x, y, z, out):  # type: ignore[no-untyped-def]
     """Radiance of the sky in a direction, into ``out``."""
     row = math.asin(min(max(z, 0.0), 1.0)) / _HALF_PI * SKY_HEIGHT - 0.5
     column = (math.atan2(y, x) + math.pi) / (2 * math.pi) * SKY_WIDTH - 0.5
-    r0 = int(math.floor(row))
-    c0 = int(math.floor(column))
+    r0 = math.floor(row)
+    c0 = math.floor(column)
     fr = row - r0
     fc = column - c0
     ra, rb = min(max(r0, 0), SKY_HEIGHT - 1), min(max(r0 + 1, 0), SKY_HEIGHT - 1)
@@ -32,7 +32,7 @@ def _sky(sky, x, y, z, out):
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _mirror(sky, light, x, y, z, out):
+def _mirror(sky, light, x, y, z, out):  # type: ignore[no-untyped-def]
     """What is seen in a mirror that looks that way: sky, a dim row of houses at the horizon, or the road."""
     azimuth = math.atan2(y, x)
     skyline = 0.10 + 0.12 * value_noise(azimuth * 4.0, 3.7) + 0.08 * value_noise(azimuth * 13.0, 9.1)
@@ -48,7 +48,7 @@ def _mirror(sky, light, x, y, z, out):
 
 
 @njit(cache=True, nogil=True)
-def locate(triangle, u, v, distance, direction, origin, corners, normals, sun, position, normal, towards_sun):
+def locate(triangle, u, v, distance, direction, origin, corners, normals, sun, position, normal, towards_sun):  # type: ignore[no-untyped-def]
     """World position and shading normal of N hits; returns how many of them can see the sun at all.
 
     ``position`` and ``normal`` (N, 3) and ``towards_sun`` (N,) bool are filled; normals look against the ray.
@@ -60,8 +60,16 @@ def locate(triangle, u, v, distance, direction, origin, corners, normals, sun, p
         if t < 0:
             continue
         w = 1.0 - u[i] - v[i]
-        ex0, ey0, ez0 = corners[t, 1, 0] - corners[t, 0, 0], corners[t, 1, 1] - corners[t, 0, 1], corners[t, 1, 2] - corners[t, 0, 2]
-        ex1, ey1, ez1 = corners[t, 2, 0] - corners[t, 0, 0], corners[t, 2, 1] - corners[t, 0, 1], corners[t, 2, 2] - corners[t, 0, 2]
+        ex0, ey0, ez0 = (
+            corners[t, 1, 0] - corners[t, 0, 0],
+            corners[t, 1, 1] - corners[t, 0, 1],
+            corners[t, 1, 2] - corners[t, 0, 2],
+        )
+        ex1, ey1, ez1 = (
+            corners[t, 2, 0] - corners[t, 0, 0],
+            corners[t, 2, 1] - corners[t, 0, 1],
+            corners[t, 2, 2] - corners[t, 0, 2],
+        )
         gx, gy, gz = ey0 * ez1 - ez0 * ey1, ez0 * ex1 - ex0 * ez1, ex0 * ey1 - ey0 * ex1
         length = math.sqrt(gx * gx + gy * gy + gz * gz) + 1e-20
         gx, gy, gz = gx / length, gy / length, gz / length
@@ -86,8 +94,28 @@ def locate(triangle, u, v, distance, direction, origin, corners, normals, sun, p
 
 
 @njit(cache=True, nogil=True)
-def shade(triangle, u, v, distance, direction, position, normal, lit, open_sky, uv, material, colour, seed, table, textures, road,
-          sky, light, pixel_angle, out):
+def shade(  # type: ignore[no-untyped-def]
+    triangle,
+    u,
+    v,
+    distance,
+    direction,
+    position,
+    normal,
+    lit,
+    open_sky,
+    uv,
+    material,
+    colour,
+    seed,
+    table,
+    textures,
+    road,
+    sky,
+    light,
+    pixel_angle,
+    out,
+):
     """Linear radiance (N, 3) of N camera rays into ``out``.
 
     ``lit`` (N,) is 1 where the sun reaches, ``open_sky`` (N,) the share of the surroundings that is open, ``table`` the
@@ -142,15 +170,36 @@ def shade(triangle, u, v, distance, direction, position, normal, lit, open_sky, 
                 albedo[k] *= shade_k
         elif texture > 0:
             sample(textures, texture, s / tile, r / tile, large / tile * SIZE, albedo)
-        _light_surface(kind, albedo, specular, gloss, nx, ny, nz, dx, dy, dz, px, py, pz, lit[i], open_sky[i], glow, facing, sky, light,
-                       mirror, out[i])
+        _light_surface(
+            kind,
+            albedo,
+            specular,
+            gloss,
+            nx,
+            ny,
+            nz,
+            dx,
+            dy,
+            dz,
+            px,
+            py,
+            pz,
+            lit[i],
+            open_sky[i],
+            glow,
+            facing,
+            sky,
+            light,
+            mirror,
+            out[i],
+        )
         far = 1 - math.exp(-distance[i] / light[15])
         for k in range(3):
             out[i, k] = out[i, k] * (1 - far) + light[12 + k] * far
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _ground(textures, texture, tile, x, y, dx, dy, small, large, albedo):
+def _ground(textures, texture, tile, x, y, dx, dy, small, large, albedo):  # type: ignore[no-untyped-def]
     """Texture of a horizontal surface by world position, filtered along the view, with large-scale variation."""
     flat = math.sqrt(dx * dx + dy * dy) + 1e-9
     taps = 4
@@ -160,7 +209,14 @@ def _ground(textures, texture, tile, x, y, dx, dy, small, large, albedo):
     for j in range(taps):
         d = (j - 1.5) * step
         albedo[0], albedo[1], albedo[2] = keep0, keep1, keep2
-        sample(textures, texture, (x + dx / flat * d) / tile, (y + dy / flat * d) / tile, max(small, step) / tile * SIZE, albedo)
+        sample(
+            textures,
+            texture,
+            (x + dx / flat * d) / tile,
+            (y + dy / flat * d) / tile,
+            max(small, step) / tile * SIZE,
+            albedo,
+        )
         red += albedo[0]
         green += albedo[1]
         blue += albedo[2]
@@ -169,7 +225,7 @@ def _ground(textures, texture, tile, x, y, dx, dy, small, large, albedo):
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _carriageway(textures, texture, road, s, t, small, large, dx, dy, albedo, specular):
+def _carriageway(textures, texture, road, s, t, small, large, dx, dy, albedo, specular):  # type: ignore[no-untyped-def]
     """Wheel tracks, repairs and painted lines on the road; returns its mirror share."""
     half = road[0] - road[5]
     lane = half / 2 if road[3] == 0 else half / 4
@@ -179,7 +235,10 @@ def _carriageway(textures, texture, road, s, t, small, large, dx, dy, albedo, sp
     patch = value_noise(cell_s * 17.31, cell_t * 9.77)
     dark = 1.0 - 0.10 * track
     if patch > 0.86:
-        inset = min(min(s / 7.3 - cell_s, 1 - (s / 7.3 - cell_s)) * 7.3, min((t + 20) / 1.9 - cell_t, 1 - ((t + 20) / 1.9 - cell_t)) * 1.9)
+        inset = min(
+            min(s / 7.3 - cell_s, 1 - (s / 7.3 - cell_s)) * 7.3,
+            min((t + 20) / 1.9 - cell_t, 1 - ((t + 20) / 1.9 - cell_t)) * 1.9,
+        )
         if inset > 0.12:
             dark *= 0.74
     paint = road_mark(s, t, road, max(small, large * 0.7))
@@ -190,13 +249,32 @@ def _carriageway(textures, texture, road, s, t, small, large, dx, dy, albedo, sp
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _light_surface(kind, albedo, specular, gloss, nx, ny, nz, dx, dy, dz, px, py, pz, lit, open_sky, glow, facing, sky, light, mirror, out):
+def _light_surface(  # type: ignore[no-untyped-def]
+    kind,
+    albedo,
+    specular,
+    gloss,
+    nx,
+    ny,
+    nz,
+    dx,
+    dy,
+    dz,
+    px,
+    py,
+    pz,
+    lit,
+    open_sky,
+    glow,
+    facing,
+    sky,
+    light,
+    mirror,
+    out,
+):
     """Radiance that leaves a surface towards the eye, into ``out``."""
     cosine = nx * light[0] + ny * light[1] + nz * light[2]
-    if kind == 6:
-        direct = lit * (0.38 + 0.62 * max(cosine, 0.0) + 0.30 * max(-cosine, 0.0))
-    else:
-        direct = lit * max(cosine, 0.0)
+    direct = lit * (0.38 + 0.62 * max(cosine, 0.0) + 0.3 * max(-cosine, 0.0)) if kind == 6 else lit * max(cosine, 0.0)
     up = 0.5 + 0.5 * nz
     near = _lamps(px, py, pz, nx, ny, nz, light)
     fresnel = specular + (1 - specular) * (1 - facing) ** 5 * gloss * gloss if specular > 0 else 0.0
@@ -216,14 +294,18 @@ def _light_surface(kind, albedo, specular, gloss, nx, ny, nz, dx, dy, dz, px, py
         ambient = (light[6 + k] * up + light[9 + k] * (1 - up)) * open_sky
         body = albedo[k] * (direct * light[3 + k] + ambient + near * (1.0 - 0.12 * k))
         tint = albedo[k] * 1.6 if kind == 7 else 1.0
-        out[k] = body * (1 - fresnel) + tint * (fresnel * shield * mirror[k] + min(spot, 12.0) * light[3 + k]) + glow * albedo[k]
+        out[k] = (
+            body * (1 - fresnel)
+            + tint * (fresnel * shield * mirror[k] + min(spot, 12.0) * light[3 + k])
+            + glow * albedo[k]
+        )
     if kind == 5 and light[17] > 0:
         for k in range(3):
             out[k] += albedo[k] * 2.2
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _lamps(px, py, pz, nx, ny, nz, light):
+def _lamps(px, py, pz, nx, ny, nz, light):  # type: ignore[no-untyped-def]
     """Light from the car's headlamps and the street lamps at night."""
     if light[17] == 0:
         return 0.0

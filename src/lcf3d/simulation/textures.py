@@ -40,7 +40,8 @@ def _joints(rows: int, columns: int, joint: float, shift: float, rng: np.random.
     edge_v = np.minimum(v * rows % 1, 1 - v * rows % 1) / rows
     edge_u = np.minimum(across % 1, 1 - across % 1) / columns
     groove = np.clip(np.minimum(edge_u, edge_v) / joint, 0, 1)
-    return stone * (0.55 + 0.45 * groove)
+    result: Tile = stone * (0.55 + 0.45 * groove)
+    return result
 
 
 def _asphalt(rng: np.random.Generator) -> Tile:
@@ -66,7 +67,9 @@ def _cobbles(rng: np.random.Generator) -> Tile:
         owner[closer] = k
         nearest = np.minimum(nearest, d)
     groove = np.clip((second - nearest) * n / 0.25, 0, 1)
-    return _grey((1 + 0.12 * rng.normal(size=len(centres)))[owner] * (0.5 + 0.5 * groove) * (1 + 0.06 * _noise(rng, 0.6, 8)))
+    return _grey(
+        (1 + 0.12 * rng.normal(size=len(centres)))[owner] * (0.5 + 0.5 * groove) * (1 + 0.06 * _noise(rng, 0.6, 8))
+    )
 
 
 def _grass(rng: np.random.Generator) -> Tile:
@@ -90,7 +93,9 @@ def _cloth_patterns(rng: np.random.Generator) -> dict[str, Tile]:
         "stripes": np.stack([stripes * folds, stripes**0.9 * folds, stripes**0.8 * folds], axis=-1),
         "hair": _grey(1 + 0.25 * _noise(rng, 0.7, 4, (0.15, 2.0))),
         "tarpaulin": _grey(folds * (1 + 0.10 * np.cos(u * 2 * np.pi * 3)) * np.where(v % 1 < 0.02, 0.7, 1)),
-        "ribs": _grey(1 + 0.22 * np.sign(np.sin(u * 2 * np.pi * 5)) * np.clip(np.abs(np.sin(u * 2 * np.pi * 5)) * 4, 0, 1)),
+        "ribs": _grey(
+            1 + 0.22 * np.sign(np.sin(u * 2 * np.pi * 5)) * np.clip(np.abs(np.sin(u * 2 * np.pi * 5)) * 4, 0, 1)
+        ),
     }
 
 

@@ -72,7 +72,9 @@ class Recipe:
         return f"{drive:04d}_{number:04d}"
 
 
-def write_dataset(recipe: Recipe, root: Path, jobs: int = 1, resume: bool = False, progress: Callable[[int], None] = lambda _: None) -> list[str]:
+def write_dataset(
+    recipe: Recipe, root: Path, jobs: int = 1, resume: bool = False, progress: Callable[[int], None] = lambda _: None
+) -> list[str]:
     """Simulate a data set into a folder.
 
     Args:
@@ -126,9 +128,13 @@ def _prepare(recipe: Recipe, root: Path, resume: bool) -> None:
     settings = root / SETTINGS_FILE
     if root.is_dir() and any(root.iterdir()):
         if not resume:
-            raise ConfigError(f"{root} is not empty; choose another folder, or add --resume to complete a data set begun there")
+            raise ConfigError(
+                f"{root} is not empty; choose another folder, or add --resume to complete a data set begun there"
+            )
         if not settings.is_file():
-            raise ConfigError(f"{root} holds no {SETTINGS_FILE}, so no simulated data set was begun there; choose another folder")
+            raise ConfigError(
+                f"{root} holds no {SETTINGS_FILE}, so no simulated data set was begun there; choose another folder"
+            )
         found = read_json(settings)
         if found != asdict(recipe):
             raise ConfigError(f"{root} was begun with other settings ({found}); use the same, or choose another folder")
@@ -144,7 +150,13 @@ def _chunks(recipe: Recipe, missing: list[int]) -> list[list[int]]:
     chunks: list[list[int]] = []
     for index in missing:
         last = chunks[-1] if chunks else None
-        if last and len(last) < _CHUNK and recipe.sequence and last[-1] == index - 1 and recipe.place(index)[0] == recipe.place(last[0])[0]:
+        if (
+            last
+            and len(last) < _CHUNK
+            and recipe.sequence
+            and last[-1] == index - 1
+            and recipe.place(index)[0] == recipe.place(last[0])[0]
+        ):
             last.append(index)
         else:
             chunks.append([index])
@@ -155,8 +167,16 @@ def _write_frames(recipe: Recipe, root: Path, indices: list[int], threads: int) 
     """Simulate and write consecutive frames of one drive; returns their indices."""
     layout = _layout(recipe)
     drive, first = recipe.place(indices[0])
-    frames = simulate_drive(recipe.preset, recipe.seed, recipe.frames_of(drive), drive=drive, street=recipe.street, density=recipe.density,
-                            threads=threads, first=first)
+    frames = simulate_drive(
+        recipe.preset,
+        recipe.seed,
+        recipe.frames_of(drive),
+        drive=drive,
+        street=recipe.street,
+        density=recipe.density,
+        threads=threads,
+        first=first,
+    )
     for index, frame in zip(indices, frames, strict=False):
         try:
             layout.write_frame(root, recipe.id(index), frame)
@@ -165,7 +185,9 @@ def _write_frames(recipe: Recipe, root: Path, indices: list[int], threads: int) 
     return indices
 
 
-def _in_processes(recipe: Recipe, root: Path, chunks: list[list[int]], jobs: int, progress: Callable[[int], None]) -> None:
+def _in_processes(
+    recipe: Recipe, root: Path, chunks: list[list[int]], jobs: int, progress: Callable[[int], None]
+) -> None:
     """Write the chunks in several processes; the first error stops the rest."""
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(min(jobs, len(chunks)), mp_context=context) as pool:
@@ -180,4 +202,6 @@ def _in_processes(recipe: Recipe, root: Path, chunks: list[list[int]], jobs: int
 
 def _write_error(root: Path, error: OSError) -> DatasetError:
     reason = error.strerror or str(error)
-    return DatasetError(f"cannot write to {root}: {reason}; free some space or choose another folder, then go on with --resume")
+    return DatasetError(
+        f"cannot write to {root}: {reason}; free some space or choose another folder, then go on with --resume"
+    )

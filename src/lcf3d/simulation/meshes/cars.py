@@ -2,97 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lcf3d.simulation.materials import MATERIAL_ID
+from lcf3d.simulation.meshes.car_shapes import CarShape
 from lcf3d.simulation.meshes.primitives import Mesh, grid, panel, slot, tube, wheel
 
 PAINT_MARK: Final = slot(0)
 """Colour of the bodywork in the templates, exchanged for the car's own colour."""
 _BLACK: Final = (0.02, 0.02, 0.022)
 _GLASS: Final = (0.025, 0.03, 0.032)
-
-
-@dataclass(frozen=True)
-class CarShape:
-    """The side view of a car, from the front bumper (0) to the rear (1).
-
-    Attributes:
-        size: (length, width, height) in metres at which the template is built.
-        profile: (position, height) pairs of the outline on the centre line, as shares of length and height.
-        screen: positions of the lower and upper edge of the windscreen.
-        rear: positions of the upper and lower edge of the rear window.
-        side_glass: positions where the side windows begin and end.
-        belt: height of the lower edge of the side windows, front and rear.
-        axles: positions of front and rear axle.
-        wheel_radius: metres.
-    """
-
-    size: tuple[float, float, float]
-    profile: tuple[tuple[float, float], ...]
-    screen: tuple[float, float]
-    rear: tuple[float, float]
-    side_glass: tuple[float, float]
-    belt: tuple[float, float] = (0.61, 0.65)
-    axles: tuple[float, float] = (0.19, 0.81)
-    wheel_radius: float = 0.31
-
-
-_FRONT: Final = ((0.0, 0.36), (0.006, 0.45), (0.02, 0.52), (0.05, 0.565))
-SHAPES: Final[dict[str, CarShape]] = {
-    "hatchback": CarShape(
-        (3.9, 1.66, 1.47),
-        (*_FRONT, (0.14, 0.61), (0.25, 0.67), (0.41, 0.94), (0.50, 1.0), (0.72, 0.985), (0.88, 0.93), (0.965, 0.68),
-         (0.985, 0.58), (1.0, 0.40)),
-        (0.25, 0.41), (0.885, 0.965), (0.36, 0.86),
-    ),
-    "small": CarShape(
-        (3.5, 1.6, 1.5),
-        (*_FRONT, (0.11, 0.62), (0.19, 0.69), (0.36, 0.95), (0.46, 1.0), (0.75, 0.99), (0.91, 0.94), (0.975, 0.66),
-         (0.99, 0.56), (1.0, 0.42)),
-        (0.19, 0.36), (0.915, 0.97), (0.31, 0.88), axles=(0.17, 0.83), wheel_radius=0.28,
-    ),
-    "saloon": CarShape(
-        (4.5, 1.75, 1.42),
-        (*_FRONT, (0.15, 0.62), (0.275, 0.67), (0.42, 0.95), (0.50, 1.0), (0.62, 0.99), (0.69, 0.95), (0.83, 0.715),
-         (0.965, 0.675), (0.988, 0.60), (1.0, 0.40)),
-        (0.275, 0.42), (0.69, 0.825), (0.38, 0.76),
-    ),
-    "estate": CarShape(
-        (4.5, 1.74, 1.46),
-        (*_FRONT, (0.15, 0.61), (0.265, 0.665), (0.41, 0.95), (0.50, 1.0), (0.80, 0.985), (0.915, 0.94), (0.975, 0.67),
-         (0.988, 0.58), (1.0, 0.40)),
-        (0.265, 0.41), (0.92, 0.972), (0.37, 0.90),
-    ),
-    "suv": CarShape(
-        (4.4, 1.82, 1.68),
-        ((0.0, 0.36), (0.006, 0.47), (0.02, 0.57), (0.05, 0.60), (0.15, 0.635), (0.255, 0.68), (0.39, 0.95), (0.48, 1.0),
-         (0.80, 0.985), (0.91, 0.94), (0.97, 0.68), (0.988, 0.60), (1.0, 0.40)),
-        (0.255, 0.39), (0.915, 0.967), (0.35, 0.89), (0.63, 0.66), wheel_radius=0.36,
-    ),
-    "minivan": CarShape(
-        (4.3, 1.78, 1.66),
-        ((0.0, 0.34), (0.006, 0.42), (0.02, 0.50), (0.06, 0.56), (0.16, 0.64), (0.21, 0.67), (0.38, 0.95), (0.48, 1.0),
-         (0.82, 0.99), (0.925, 0.95), (0.978, 0.62), (0.99, 0.55), (1.0, 0.38)),
-        (0.20, 0.38), (0.93, 0.976), (0.30, 0.91), (0.58, 0.62),
-    ),
-    "van": CarShape(
-        (5.0, 1.92, 2.15),
-        ((0.0, 0.27), (0.006, 0.36), (0.02, 0.42), (0.06, 0.46), (0.14, 0.52), (0.17, 0.55), (0.285, 0.90), (0.34, 0.99),
-         (0.45, 1.0), (0.93, 1.0), (0.985, 0.985), (0.996, 0.7), (1.0, 0.30)),
-        (0.165, 0.285), (0.986, 0.996), (0.22, 0.38), (0.52, 0.53), axles=(0.17, 0.79), wheel_radius=0.34,
-    ),
-    "bus_van": CarShape(
-        (5.2, 1.95, 2.05),
-        ((0.0, 0.28), (0.006, 0.37), (0.02, 0.43), (0.06, 0.47), (0.14, 0.53), (0.17, 0.56), (0.285, 0.91), (0.34, 0.99),
-         (0.45, 1.0), (0.93, 1.0), (0.975, 0.975), (0.992, 0.62), (1.0, 0.30)),
-        (0.165, 0.285), (0.975, 0.992), (0.22, 0.95), (0.54, 0.55), axles=(0.17, 0.79), wheel_radius=0.34,
-    ),
-}
 
 
 def _stations(shape: CarShape, fine: bool) -> NDArray[np.float64]:
@@ -106,7 +28,8 @@ def _stations(shape: CarShape, fine: bool) -> NDArray[np.float64]:
     positions += [a + d for a in shape.axles for d in around]
     positions += [p for p, _ in shape.profile]
     values = np.unique(np.round(np.clip(positions, 0, 1), 4))
-    return values[np.concatenate([[True], np.diff(values) > (0.0025 if fine else 0.0065)])]
+    apart: NDArray[np.float64] = values[np.concatenate([[True], np.diff(values) > (0.0025 if fine else 0.0065)])]
+    return apart
 
 
 def _sections(shape: CarShape, s: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -151,7 +74,7 @@ def build_car(shape: CarShape, fine: bool = True) -> Mesh:
 
     ``fine`` False leaves out what cannot be seen from more than 40 m away.
     """
-    length, width, height = shape.size
+    length, width, _ = shape.size
     s = _stations(shape, fine)
     half, glass = _sections(shape, s)
     x = (0.5 - s) * length
@@ -159,14 +82,14 @@ def build_car(shape: CarShape, fine: bool = True) -> Mesh:
     points = np.concatenate([np.repeat(x[:, None, None], full.shape[1], axis=1), full], axis=2)
     body = grid(points, "paint", PAINT_MARK, crease=0.82)
     body = _colour_body(body, shape, s, glass)
-    caps = [
-        grid(np.stack([points[i] * [1, 0, 1], points[i]]), "paint", PAINT_MARK) for i in (0, -1)
-    ]
+    caps = [grid(np.stack([points[i] * [1, 0, 1], points[i]]), "paint", PAINT_MARK) for i in (0, -1)]
     parts = [body, *caps, *_details(shape, fine), _interior(shape)]
     for axle in shape.axles:
         for side in (1.0, -1.0):
             y = side * (width / 2 - 0.115)
-            parts.append(wheel((0.5 - axle) * length, y, shape.wheel_radius, 0.2, side, (0.45, 0.46, 0.48), 18 if fine else 9))
+            parts.append(
+                wheel((0.5 - axle) * length, y, shape.wheel_radius, 0.2, side, (0.45, 0.46, 0.48), 18 if fine else 9)
+            )
     return Mesh.join(parts)
 
 
@@ -194,7 +117,11 @@ def _colour_body(body: Mesh, shape: CarShape, s: NDArray[np.float64], glass: NDA
         material[:, column] = MATERIAL_ID["plastic"]
         colour[:, column] = _BLACK
     return Mesh(
-        body.corners, body.normals, body.uv, material.reshape(-1).repeat(2), colour.reshape(-1, 3).repeat(2, axis=0),
+        body.corners,
+        body.normals,
+        body.uv,
+        material.reshape(-1).repeat(2),
+        colour.reshape(-1, 3).repeat(2, axis=0),
         body.seed,
     )
 
@@ -210,41 +137,116 @@ def _details(shape: CarShape, fine: bool) -> list[Mesh]:
     for side in (1.0, -1.0):
         inner, outer = 0.42 * half_w * side, 0.845 * half_w * side
         high = 0.055 * height
-        parts.append(panel((half_l + e - 0.012, inner, lamp_z - high), (half_l - 0.035, outer, lamp_z - high * 0.8),
-                           (half_l - 0.075, outer, lamp_z + high * 1.25), (half_l - 0.022, inner, lamp_z + high * 0.8),
-                           "headlamp", (0.30, 0.32, 0.34)))
-        parts.append(panel((half_l - 0.035, outer, lamp_z - high * 0.8), (half_l - 0.24, 0.963 * half_w * side, lamp_z),
-                           (half_l - 0.30, 0.965 * half_w * side, lamp_z + high * 1.4),
-                           (half_l - 0.075, outer, lamp_z + high * 1.25), "headlamp", (0.30, 0.32, 0.34)))
+        parts.append(
+            panel(
+                (half_l + e - 0.012, inner, lamp_z - high),
+                (half_l - 0.035, outer, lamp_z - high * 0.8),
+                (half_l - 0.075, outer, lamp_z + high * 1.25),
+                (half_l - 0.022, inner, lamp_z + high * 0.8),
+                "headlamp",
+                (0.30, 0.32, 0.34),
+            )
+        )
+        parts.append(
+            panel(
+                (half_l - 0.035, outer, lamp_z - high * 0.8),
+                (half_l - 0.24, 0.963 * half_w * side, lamp_z),
+                (half_l - 0.30, 0.965 * half_w * side, lamp_z + high * 1.4),
+                (half_l - 0.075, outer, lamp_z + high * 1.25),
+                "headlamp",
+                (0.30, 0.32, 0.34),
+            )
+        )
         rear_z, rear_h = (0.42 if tall else 0.53) * height, (0.12 if tall else 0.075) * height
         rin = (0.74 if tall else 0.52) * half_w * side
-        parts.append(panel((-half_l - 0.004, rin, rear_z - rear_h), (-half_l + 0.025, 0.86 * half_w * side, rear_z - rear_h),
-                           (-half_l + 0.06, 0.86 * half_w * side, rear_z + rear_h), (-half_l + 0.022, rin, rear_z + rear_h),
-                           "tail_lamp", (0.40, 0.012, 0.012)))
-        parts.append(panel((-half_l + 0.02, 0.868 * half_w * side, rear_z - rear_h),
-                           (-half_l + 0.17, 0.962 * half_w * side, rear_z - rear_h * 0.5),
-                           (-half_l + 0.19, 0.962 * half_w * side, rear_z + rear_h),
-                           (-half_l + 0.055, 0.868 * half_w * side, rear_z + rear_h), "tail_lamp", (0.40, 0.012, 0.012)))
+        parts.append(
+            panel(
+                (-half_l - 0.004, rin, rear_z - rear_h),
+                (-half_l + 0.025, 0.86 * half_w * side, rear_z - rear_h),
+                (-half_l + 0.06, 0.86 * half_w * side, rear_z + rear_h),
+                (-half_l + 0.022, rin, rear_z + rear_h),
+                "tail_lamp",
+                (0.40, 0.012, 0.012),
+            )
+        )
+        parts.append(
+            panel(
+                (-half_l + 0.02, 0.868 * half_w * side, rear_z - rear_h),
+                (-half_l + 0.17, 0.962 * half_w * side, rear_z - rear_h * 0.5),
+                (-half_l + 0.19, 0.962 * half_w * side, rear_z + rear_h),
+                (-half_l + 0.055, 0.868 * half_w * side, rear_z + rear_h),
+                "tail_lamp",
+                (0.40, 0.012, 0.012),
+            )
+        )
         mirror_x = (0.5 - shape.side_glass[0] - 0.01) * length
         mirror_z = (shape.belt[0] + 0.035) * height
         at = 0.87 * half_w * side
-        parts.append(tube([(mirror_x + 0.05, at, mirror_z), (mirror_x, at + 0.06 * side, mirror_z),
-                           (mirror_x - 0.02, at + 0.10 * side, mirror_z)], [0.02, 0.07, 0.05],
-                          "paint", PAINT_MARK, 6))
+        parts.append(
+            tube(
+                [
+                    (mirror_x + 0.05, at, mirror_z),
+                    (mirror_x, at + 0.06 * side, mirror_z),
+                    (mirror_x - 0.02, at + 0.10 * side, mirror_z),
+                ],
+                [0.02, 0.07, 0.05],
+                "paint",
+                PAINT_MARK,
+                6,
+            )
+        )
     low, mid = 0.22 * height, 0.36 * height
-    parts.append(panel((half_l + e, -0.36 * half_w, mid - 0.02), (half_l + e, 0.36 * half_w, mid - 0.02),
-                       (half_l + e - 0.012, 0.42 * half_w, lamp_z + 0.03), (half_l + e - 0.012, -0.42 * half_w, lamp_z + 0.03),
-                       "plastic", _BLACK))
-    parts.append(panel((half_l + e, -0.60 * half_w, low - 0.04), (half_l + e, 0.60 * half_w, low - 0.04),
-                       (half_l + e, 0.55 * half_w, low + 0.06), (half_l + e, -0.55 * half_w, low + 0.06), "plastic", _BLACK))
+    parts.append(
+        panel(
+            (half_l + e, -0.36 * half_w, mid - 0.02),
+            (half_l + e, 0.36 * half_w, mid - 0.02),
+            (half_l + e - 0.012, 0.42 * half_w, lamp_z + 0.03),
+            (half_l + e - 0.012, -0.42 * half_w, lamp_z + 0.03),
+            "plastic",
+            _BLACK,
+        )
+    )
+    parts.append(
+        panel(
+            (half_l + e, -0.60 * half_w, low - 0.04),
+            (half_l + e, 0.60 * half_w, low - 0.04),
+            (half_l + e, 0.55 * half_w, low + 0.06),
+            (half_l + e, -0.55 * half_w, low + 0.06),
+            "plastic",
+            _BLACK,
+        )
+    )
     white = (0.62, 0.62, 0.60)
-    parts.append(panel((half_l + e + 0.006, -0.26, mid - 0.09), (half_l + e + 0.006, 0.26, mid - 0.09),
-                       (half_l + e + 0.006, 0.26, mid + 0.02), (half_l + e + 0.006, -0.26, mid + 0.02), "plate", white))
-    parts.append(panel((-half_l - 0.02, 0.26, mid), (-half_l - 0.02, -0.26, mid), (-half_l - 0.02, -0.26, mid + 0.11),
-                       (-half_l - 0.02, 0.26, mid + 0.11), "plate", white))
-    parts.append(panel((-half_l - 0.01, -0.78 * half_w, 0.15 * height), (-half_l - 0.01, 0.78 * half_w, 0.15 * height),
-                       (-half_l - 0.01, 0.76 * half_w, 0.24 * height), (-half_l - 0.01, -0.76 * half_w, 0.24 * height),
-                       "plastic", _BLACK))
+    parts.append(
+        panel(
+            (half_l + e + 0.006, -0.26, mid - 0.09),
+            (half_l + e + 0.006, 0.26, mid - 0.09),
+            (half_l + e + 0.006, 0.26, mid + 0.02),
+            (half_l + e + 0.006, -0.26, mid + 0.02),
+            "plate",
+            white,
+        )
+    )
+    parts.append(
+        panel(
+            (-half_l - 0.02, 0.26, mid),
+            (-half_l - 0.02, -0.26, mid),
+            (-half_l - 0.02, -0.26, mid + 0.11),
+            (-half_l - 0.02, 0.26, mid + 0.11),
+            "plate",
+            white,
+        )
+    )
+    parts.append(
+        panel(
+            (-half_l - 0.01, -0.78 * half_w, 0.15 * height),
+            (-half_l - 0.01, 0.78 * half_w, 0.15 * height),
+            (-half_l - 0.01, 0.76 * half_w, 0.24 * height),
+            (-half_l - 0.01, -0.76 * half_w, 0.24 * height),
+            "plastic",
+            _BLACK,
+        )
+    )
     return parts + (_door_lines(shape) if fine else [])
 
 
@@ -258,16 +260,38 @@ def _door_lines(shape: CarShape) -> list[Mesh]:
         y = side * (width / 2 + 0.002)
         for position in (first - 0.02, middle, min(last - 0.02, shape.axles[1] - 0.09)):
             x = (0.5 - position) * length
-            parts.append(panel((x - 0.006, y * 0.985, 0.2 * height), (x + 0.006, y * 0.985, 0.2 * height),
-                               (x + 0.006, y, 0.42 * height), (x - 0.006, y, 0.42 * height), "plastic", _BLACK))
-            parts.append(panel((x - 0.006, y, 0.42 * height), (x + 0.006, y, 0.42 * height),
-                               (x + 0.006, y * 0.985, 0.56 * height), (x - 0.006, y * 0.985, 0.56 * height),
-                               "plastic", _BLACK))
+            parts.append(
+                panel(
+                    (x - 0.006, y * 0.985, 0.2 * height),
+                    (x + 0.006, y * 0.985, 0.2 * height),
+                    (x + 0.006, y, 0.42 * height),
+                    (x - 0.006, y, 0.42 * height),
+                    "plastic",
+                    _BLACK,
+                )
+            )
+            parts.append(
+                panel(
+                    (x - 0.006, y, 0.42 * height),
+                    (x + 0.006, y, 0.42 * height),
+                    (x + 0.006, y * 0.985, 0.56 * height),
+                    (x - 0.006, y * 0.985, 0.56 * height),
+                    "plastic",
+                    _BLACK,
+                )
+            )
         for position in (middle - 0.035, last - 0.07):
             x = (0.5 - position) * length
-            parts.append(panel((x - 0.09, y * 1.005, 0.51 * height), (x + 0.09, y * 1.005, 0.51 * height),
-                               (x + 0.09, y * 1.005, 0.53 * height), (x - 0.09, y * 1.005, 0.53 * height),
-                               "plastic", _BLACK))
+            parts.append(
+                panel(
+                    (x - 0.09, y * 1.005, 0.51 * height),
+                    (x + 0.09, y * 1.005, 0.51 * height),
+                    (x + 0.09, y * 1.005, 0.53 * height),
+                    (x - 0.09, y * 1.005, 0.53 * height),
+                    "plastic",
+                    _BLACK,
+                )
+            )
     return parts
 
 
@@ -277,12 +301,22 @@ def _interior(shape: CarShape) -> Mesh:
     x0, x1 = (0.5 - shape.side_glass[1]) * length, (0.5 - shape.screen[0]) * length
     dark = (0.03, 0.03, 0.032)
     z = 0.45 * height
-    floor = panel((x0, -0.42 * width, z), (x1, -0.42 * width, z), (x1, 0.42 * width, z), (x0, 0.42 * width, z), "cloth", dark)
+    floor = panel(
+        (x0, -0.42 * width, z), (x1, -0.42 * width, z), (x1, 0.42 * width, z), (x0, 0.42 * width, z), "cloth", dark
+    )
     seats = [floor]
     front = (0.5 - (shape.side_glass[0] + shape.side_glass[1]) / 2) * length
     rows = (front, front - 0.9) if front - 0.9 > x0 + 0.2 else (front,)
     for x in rows:
         for y in (-0.2 * width, 0.2 * width):
-            seats.append(tube([(x, y, z), (x - 0.12, y, z + 0.24 * height), (x - 0.15, y, z + 0.36 * height)],
-                              [0.2, 0.19, 0.1], "cloth", dark, 6, 0.4))
+            seats.append(
+                tube(
+                    [(x, y, z), (x - 0.12, y, z + 0.24 * height), (x - 0.15, y, z + 0.36 * height)],
+                    [0.2, 0.19, 0.1],
+                    "cloth",
+                    dark,
+                    6,
+                    0.4,
+                )
+            )
     return Mesh.join(seats)

@@ -1,5 +1,6 @@
 """Pedestrians, riders and two-wheelers, built from tapered limbs in a pose."""
 
+# ruff: noqa: RUF005 - the vectors that lists are added to are numpy arrays
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -15,15 +16,33 @@ Vector = NDArray[np.float64]
 
 SKIN_TONES: Final[tuple[Colour, ...]] = ((0.55, 0.34, 0.25), (0.45, 0.26, 0.18), (0.30, 0.16, 0.10), (0.13, 0.07, 0.05))
 HAIR_COLOURS: Final[tuple[Colour, ...]] = (
-    (0.02, 0.015, 0.012), (0.06, 0.035, 0.02), (0.16, 0.09, 0.04), (0.32, 0.22, 0.11), (0.35, 0.34, 0.33),
+    (0.02, 0.015, 0.012),
+    (0.06, 0.035, 0.02),
+    (0.16, 0.09, 0.04),
+    (0.32, 0.22, 0.11),
+    (0.35, 0.34, 0.33),
 )
 TOP_COLOURS: Final[tuple[Colour, ...]] = (
-    (0.03, 0.03, 0.035), (0.30, 0.30, 0.31), (0.62, 0.61, 0.58), (0.05, 0.08, 0.20), (0.40, 0.04, 0.04),
-    (0.05, 0.18, 0.08), (0.45, 0.33, 0.18), (0.14, 0.10, 0.07), (0.08, 0.22, 0.42), (0.50, 0.12, 0.28),
-    (0.55, 0.42, 0.06), (0.10, 0.10, 0.11),
+    (0.03, 0.03, 0.035),
+    (0.30, 0.30, 0.31),
+    (0.62, 0.61, 0.58),
+    (0.05, 0.08, 0.20),
+    (0.40, 0.04, 0.04),
+    (0.05, 0.18, 0.08),
+    (0.45, 0.33, 0.18),
+    (0.14, 0.10, 0.07),
+    (0.08, 0.22, 0.42),
+    (0.50, 0.12, 0.28),
+    (0.55, 0.42, 0.06),
+    (0.10, 0.10, 0.11),
 )
 LEG_COLOURS: Final[tuple[Colour, ...]] = (
-    (0.03, 0.05, 0.12), (0.06, 0.09, 0.18), (0.02, 0.02, 0.022), (0.22, 0.18, 0.12), (0.12, 0.12, 0.13), (0.09, 0.06, 0.04),
+    (0.03, 0.05, 0.12),
+    (0.06, 0.09, 0.18),
+    (0.02, 0.02, 0.022),
+    (0.22, 0.18, 0.12),
+    (0.12, 0.12, 0.13),
+    (0.09, 0.06, 0.04),
 )
 
 
@@ -43,10 +62,6 @@ class PersonStyle:
     stout: float
     long_hair: bool
     helmet: bool
-
-
-BIKE_SLOT: Final = slot(5)
-"""Mark of the frame of a bicycle in a template; slots 0 to 4 are skin, hair, top, legs and shoes."""
 
 
 def random_palette(rng: np.random.Generator) -> list[Colour]:
@@ -69,7 +84,11 @@ def random_style(rng: np.random.Generator, open_colours: bool = False) -> Person
     """A style drawn at random; with ``open_colours`` its colours are marks for `Mesh.painted`."""
     skin, hair, top, legs, shoes = [slot(k) for k in range(5)] if open_colours else random_palette(rng)
     return PersonStyle(
-        skin, hair, top, legs, shoes,
+        skin,
+        hair,
+        top,
+        legs,
+        shoes,
         ("cloth", "cloth", "checks", "stripes", "leather")[rng.integers(5)],
         ("denim", "cloth")[rng.integers(2)],
         ("trousers", "trousers", "trousers", "coat", "skirt", "shorts")[rng.integers(6)],
@@ -100,7 +119,8 @@ class Pose:
 
 def _limb(start: Vector, angle: float, length: float, spread: float = 0.0) -> Vector:
     """The end of a limb that hangs down from ``start``, swung forward by ``angle``."""
-    return start + np.array([np.sin(angle) * length, spread, -np.cos(angle) * length])
+    end: Vector = start + np.array([np.sin(angle) * length, spread, -np.cos(angle) * length])
+    return end
 
 
 def _swap(pair: list[Vector]) -> tuple[Vector, Vector]:
@@ -109,7 +129,8 @@ def _swap(pair: list[Vector]) -> tuple[Vector, Vector]:
 
 def walking_pose(phase: float, stride: float) -> Pose:
     """A step at ``phase`` (radians); ``stride`` is the swing of the legs in radians, 0 for standing."""
-    hips, knees, ankles, shoulders, elbows, hands = ([] for _ in range(6))
+    joints: list[list[Vector]] = [[] for _ in range(6)]
+    hips, knees, ankles, shoulders, elbows, hands = joints
     bob = -0.035 * stride * abs(np.sin(phase))
     for side in (1.0, -1.0):
         swing = stride * np.sin(phase + (0 if side > 0 else np.pi))
@@ -120,22 +141,37 @@ def walking_pose(phase: float, stride: float) -> Pose:
         shoulder = np.array([0.0, 0.185 * side, 1.43 + bob])
         elbow = _limb(shoulder, -0.75 * swing - 0.03, 0.28, 0.035 * side)
         hand = _limb(elbow, -0.75 * swing + 0.22 + 0.25 * stride, 0.26, 0.01 * side)
-        for values, value in zip((hips, knees, ankles, shoulders, elbows, hands),
-                                 (hip, knee, ankle, shoulder, elbow, hand), strict=True):
+        for values, value in zip(
+            (hips, knees, ankles, shoulders, elbows, hands), (hip, knee, ankle, shoulder, elbow, hand), strict=True
+        ):
             values.append(value)
     lean = 0.03 * stride
-    return Pose(np.array([0, 0, 0.95 + bob]), np.array([lean, 0, 1.36 + bob]), np.array([lean * 1.6, 0, 1.62 + bob]),
-                _swap(hips), _swap(knees), _swap(ankles), _swap(shoulders), _swap(elbows), _swap(hands))
+    return Pose(
+        np.array([0, 0, 0.95 + bob]),
+        np.array([lean, 0, 1.36 + bob]),
+        np.array([lean * 1.6, 0, 1.62 + bob]),
+        _swap(hips),
+        _swap(knees),
+        _swap(ankles),
+        _swap(shoulders),
+        _swap(elbows),
+        _swap(hands),
+    )
 
 
 def sitting_pose() -> Pose:
     """On a bench 0.45 m high."""
     sides = (1.0, -1.0)
     return Pose(
-        np.array([0, 0, 0.52]), np.array([-0.03, 0, 0.93]), np.array([0.02, 0, 1.19]),
-        _swap([np.array([0, 0.1 * s, 0.50]) for s in sides]), _swap([np.array([0.44, 0.13 * s, 0.50]) for s in sides]),
-        _swap([np.array([0.42, 0.13 * s, 0.08]) for s in sides]), _swap([np.array([-0.03, 0.185 * s, 1.0]) for s in sides]),
-        _swap([np.array([0.06, 0.23 * s, 0.74]) for s in sides]), _swap([np.array([0.30, 0.13 * s, 0.62]) for s in sides]),
+        np.array([0, 0, 0.52]),
+        np.array([-0.03, 0, 0.93]),
+        np.array([0.02, 0, 1.19]),
+        _swap([np.array([0, 0.1 * s, 0.50]) for s in sides]),
+        _swap([np.array([0.44, 0.13 * s, 0.50]) for s in sides]),
+        _swap([np.array([0.42, 0.13 * s, 0.08]) for s in sides]),
+        _swap([np.array([-0.03, 0.185 * s, 1.0]) for s in sides]),
+        _swap([np.array([0.06, 0.23 * s, 0.74]) for s in sides]),
+        _swap([np.array([0.30, 0.13 * s, 0.62]) for s in sides]),
     )
 
 
@@ -147,16 +183,27 @@ def riding_pose(phase: float, lean: float) -> Pose:
     shoulders = [chest + np.array([0.02, 0.18 * s, 0.06]) for s in sides]
     hands = [np.array([0.42, 0.24 * s, 1.02]) for s in sides]
     elbows = [(a + b) / 2 + np.array([-0.04, 0.07 * s, -0.08]) for a, b, s in zip(shoulders, hands, sides, strict=True)]
-    ankles = [np.array([-0.02 + 0.16 * np.cos(phase + a), 0.11 * s, 0.34 + 0.16 * np.sin(phase + a)])
-              for s, a in zip(sides, (0, np.pi), strict=True)]
+    ankles = [
+        np.array([-0.02 + 0.16 * np.cos(phase + a), 0.11 * s, 0.34 + 0.16 * np.sin(phase + a)])
+        for s, a in zip(sides, (0, np.pi), strict=True)
+    ]
     hips = [pelvis + np.array([0.02, 0.09 * s, -0.03]) for s in sides]
     knees = []
     for hip, ankle in zip(hips, ankles, strict=True):
-        middle, gap = (hip + ankle) / 2, np.linalg.norm(hip - ankle)
+        middle, gap = (hip + ankle) / 2, float(np.linalg.norm(hip - ankle))
         bend = np.sqrt(max(0.44**2 - (gap / 2) ** 2, 0.0))
         knees.append(middle + np.array([bend, 0, 0.25 * bend]))
-    return Pose(pelvis, chest, chest + np.array([0.10, 0, 0.26]), _swap(hips), _swap(knees), _swap(ankles),
-                _swap(shoulders), _swap(elbows), _swap(hands))
+    return Pose(
+        pelvis,
+        chest,
+        chest + np.array([0.10, 0, 0.26]),
+        _swap(hips),
+        _swap(knees),
+        _swap(ankles),
+        _swap(shoulders),
+        _swap(elbows),
+        _swap(hands),
+    )
 
 
 def dress(pose: Pose, style: PersonStyle) -> Mesh:
@@ -172,20 +219,49 @@ def dress(pose: Pose, style: PersonStyle) -> Mesh:
         parts.append(tube([hip, (hip + knee) / 2, knee], [0.092 * k, 0.082 * k, 0.062], *thigh, sides=8))
         parts.append(tube([knee, knee * 0.6 + ankle * 0.4, ankle], [0.061, 0.060, 0.045], *shin, sides=8))
         toe = ankle + np.array([0.15, 0, -0.045])
-        parts.append(tube([ankle + [-0.05, 0, -0.035], ankle + [0.02, 0, -0.03], toe], [0.04, 0.045, 0.03],
-                          "leather", style.shoes, 6))
+        parts.append(
+            tube(
+                [ankle + [-0.05, 0, -0.035], ankle + [0.02, 0, -0.03], toe],
+                [0.04, 0.045, 0.03],
+                "leather",
+                style.shoes,
+                6,
+            )
+        )
     spine = pose.chest - pose.pelvis
-    levels = [(-0.12, 0.155, 0.105), (0.0, 0.165, 0.115), (0.35, 0.148, 0.10), (0.75, 0.175, 0.115), (1.05, 0.185, 0.105),
-              (1.22, 0.13, 0.08), (1.32, 0.055, 0.055)]
+    levels = [
+        (-0.12, 0.155, 0.105),
+        (0.0, 0.165, 0.115),
+        (0.35, 0.148, 0.10),
+        (0.75, 0.175, 0.115),
+        (1.05, 0.185, 0.105),
+        (1.22, 0.13, 0.08),
+        (1.32, 0.055, 0.055),
+    ]
     if style.clothing == "coat":
         levels = [(-1.05, 0.20, 0.16), (-0.6, 0.185, 0.145), *levels[1:]]
     parts.append(_torso(pose.pelvis, spine, levels, k, style.top_material, style.top))
     if skirted:
-        parts.append(_torso(pose.pelvis, np.array([0, 0, 0.42]), [(-1.15, 0.24, 0.21), (-0.6, 0.21, 0.17), (0.05, 0.165, 0.12)],
-                            k, style.leg_material, style.legs))
+        parts.append(
+            _torso(
+                pose.pelvis,
+                np.array([0, 0, 0.42]),
+                [(-1.15, 0.24, 0.21), (-0.6, 0.21, 0.17), (0.05, 0.165, 0.12)],
+                k,
+                style.leg_material,
+                style.legs,
+            )
+        )
     for shoulder, elbow, hand in zip(pose.shoulders, pose.elbows, pose.hands, strict=True):
-        parts.append(tube([shoulder, (shoulder + elbow) / 2, elbow], [0.062 * k, 0.054 * k, 0.045], style.top_material,
-                          style.top, 7))
+        parts.append(
+            tube(
+                [shoulder, (shoulder + elbow) / 2, elbow],
+                [0.062 * k, 0.054 * k, 0.045],
+                style.top_material,
+                style.top,
+                7,
+            )
+        )
         sleeve = ("skin", style.skin) if style.clothing in ("shorts", "skirt") else (style.top_material, style.top)
         parts.append(tube([elbow, hand], [0.043, 0.034], *sleeve, sides=7))
         parts.append(ellipsoid(hand + (hand - elbow) * 0.2, (0.045, 0.03, 0.055), "skin", style.skin, 5))
@@ -194,15 +270,19 @@ def dress(pose: Pose, style: PersonStyle) -> Mesh:
     return Mesh.join(parts)
 
 
-def _torso(base: Vector, spine: Vector, levels: list[tuple[float, float, float]], k: float, material: str,
-           colour: Colour) -> Mesh:
+def _torso(
+    base: Vector, spine: Vector, levels: list[tuple[float, float, float]], k: float, material: str, colour: Colour
+) -> Mesh:
     """Elliptic rings (share along the spine, half width, half depth) around a spine, closed at both ends."""
     angle = np.arange(12) * 2 * np.pi / 12
     rings = []
     for share, across, deep in levels:
         centre = base + spine * share
         rings.append(centre + np.stack([-np.sin(angle) * deep * k, np.cos(angle) * across * k, np.zeros(12)], axis=1))
-    first, last = rings[0].mean(axis=0, keepdims=True).repeat(12, 0), rings[-1].mean(axis=0, keepdims=True).repeat(12, 0)
+    first, last = (
+        rings[0].mean(axis=0, keepdims=True).repeat(12, 0),
+        rings[-1].mean(axis=0, keepdims=True).repeat(12, 0),
+    )
     return grid(np.stack([first, *rings, last]), material, colour, closed=True, crease=0.3)
 
 
@@ -225,7 +305,11 @@ def _head(pose: Pose, style: PersonStyle) -> list[Mesh]:
 def _bag(pose: Pose, style: PersonStyle) -> list[Mesh]:
     dark = (0.05, 0.05, 0.06)
     if style.bag == "backpack":
-        return [ellipsoid((pose.pelvis + 2 * pose.chest) / 3 + [-0.19, 0, 0.02], (0.10, 0.14, 0.21), "cloth", style.shoes, 8)]
+        return [
+            ellipsoid(
+                (pose.pelvis + 2 * pose.chest) / 3 + [-0.19, 0, 0.02], (0.10, 0.14, 0.21), "cloth", style.shoes, 8
+            )
+        ]
     if style.bag == "shoulder":
         return [box(pose.hips[0] + [-0.02, 0.13, 0.0], (0.26, 0.09, 0.22), "leather", dark)]
     if style.bag == "carrier":
@@ -241,80 +325,9 @@ def pedestrian(style: PersonStyle, phase: float, stride: float) -> Mesh:
 
 
 def sitting_person(style: PersonStyle) -> Mesh:
-    """Somebody seated."""
-    return dress(sitting_pose(), PersonStyle(**{**style.__dict__, "helmet": False, "bag": "none"}))
-
-
-def bicycle(colour: Colour) -> Mesh:
-    """A bicycle about 1.75 m long, without rider."""
-    parts = []
-    tyre, metal = (0.015, 0.015, 0.015), (0.35, 0.35, 0.36)
-    for x in (0.53, -0.53):
-        parts += _bicycle_wheel(x, 0.34, tyre, metal)
-    crank, seat, head, bar = np.array([-0.05, 0, 0.29]), np.array([-0.20, 0, 0.80]), np.array([0.36, 0, 0.86]), np.array([0.40, 0, 0.72])
-    rear, front = np.array([-0.53, 0, 0.34]), np.array([0.53, 0, 0.34])
-    for a, b, r in ((crank, seat, 0.02), (seat, head - [0, 0, 0.06], 0.02), (crank, bar, 0.022), (rear, crank, 0.013),
-                    (rear, seat, 0.012), (front, bar, 0.017), (bar, head + [-0.02, 0, 0.08], 0.02)):
-        parts.append(tube([a, b], [r, r], "paint", colour, 6))
-    parts.append(tube([(0.33, -0.28, 0.99), (0.37, 0, 0.97), (0.33, 0.28, 0.99)], [0.016] * 3, "plastic", tyre, 6))
-    parts.append(tube([seat, seat + [-0.02, 0, 0.10]], [0.014, 0.014], "rim", metal, 6))
-    parts.append(ellipsoid((-0.24, 0, 0.92), (0.14, 0.075, 0.04), "leather", tyre, 6))
-    parts.append(tube([crank + [-0.15, 0.09, -0.02], crank + [0.15, -0.09, 0.02]], [0.012] * 2, "rim", metal, 5))
-    parts.append(box((0.47, 0, 0.86), (0.05, 0.06, 0.06), "headlamp", (0.7, 0.7, 0.7)))
-    parts.append(box((-0.72, 0, 0.74), (0.02, 0.06, 0.05), "tail_lamp", (0.4, 0.01, 0.01)))
-    parts.append(box((-0.52, 0, 0.74), (0.36, 0.13, 0.02), "plastic", tyre))
-    return Mesh.join(parts)
-
-
-def _bicycle_wheel(x: float, radius: float, tyre: Colour, metal: Colour) -> list[Mesh]:
-    angle = np.linspace(0, 2 * np.pi, 25)
-    circle = np.stack([np.cos(angle) * (radius - 0.018) + x, np.zeros(25), np.sin(angle) * (radius - 0.018) + radius], axis=1)
-    around = np.arange(5) * 2 * np.pi / 5
-    outward = (circle - [x, 0, radius]) / (radius - 0.018)
-    ring = circle[:, None] + 0.018 * (np.cos(around)[None, :, None] * outward[:, None]
-                                      + np.sin(around)[None, :, None] * np.array([0, 1.0, 0]))
-    parts = [grid(ring, "rubber", tyre, closed=True, crease=-1.0)]
-    for k in range(8):
-        a = k * np.pi / 8
-        arm = np.array([np.cos(a), 0, np.sin(a)]) * radius * 0.93
-        centre = np.array([x, 0.01 * (-1) ** k, radius])
-        parts.append(tube([centre - arm, centre + arm], [0.004, 0.004], "rim", metal, 3))
-    return parts
-
-
-def cyclist(style: PersonStyle, colour: Colour, phase: float, lean: float) -> Mesh:
-    """A bicycle with its rider."""
-    rider = PersonStyle(**{**style.__dict__, "bag": style.bag if style.bag == "backpack" else "none",
-                           "clothing": "trousers" if style.clothing in ("coat", "skirt") else style.clothing})
-    return Mesh.join([bicycle(colour), dress(riding_pose(phase, lean), rider)])
-
-
-def motorcycle(colour: Colour) -> Mesh:
-    """A motorcycle about 2.1 m long, without rider."""
-    black, metal = (0.02, 0.02, 0.02), (0.3, 0.3, 0.31)
-    parts = []
-    for x, width in ((0.72, 0.055), (-0.68, 0.075)):
-        angle = np.linspace(0, 2 * np.pi, 19)
-        circle = np.stack([np.cos(angle), np.zeros(19), np.sin(angle)], axis=1)
-        rows = [circle * 0.20 + [0, width, 0], circle * 0.27 + [0, width, 0], circle * 0.32, circle * 0.27 - [0, width, 0],
-                circle * 0.20 - [0, width, 0]]
-        parts.append(grid(np.stack(rows) + [x, 0, 0.32], "rubber", black, crease=0.2))
-        parts.append(grid(np.stack([circle * 0.21 + [0, 0.02, 0], circle * 0.01 + [0, 0.03, 0]]) + [x, 0, 0.32], "rim", metal))
-        parts.append(grid(np.stack([circle * 0.21 - [0, 0.02, 0], circle * 0.01 - [0, 0.03, 0]]) + [x, 0, 0.32], "rim", metal))
-    parts.append(tube([(0.72, 0.07, 0.32), (0.45, 0.07, 1.0)], [0.03, 0.03], "chrome", (0.6, 0.6, 0.6), 6))
-    parts.append(tube([(0.72, -0.07, 0.32), (0.45, -0.07, 1.0)], [0.03, 0.03], "chrome", (0.6, 0.6, 0.6), 6))
-    parts.append(ellipsoid((0.18, 0, 0.84), (0.32, 0.15, 0.16), "paint", colour, 8))
-    parts.append(ellipsoid((0.02, 0, 0.46), (0.30, 0.17, 0.22), "rim", metal, 7))
-    parts.append(tube([(-0.02, 0, 0.80), (-0.35, 0, 0.80), (-0.75, 0, 0.90)], [0.12, 0.15, 0.07], "leather", black, 7, 1.1))
-    parts.append(tube([(0.40, -0.38, 1.05), (0.46, 0, 1.02), (0.40, 0.38, 1.05)], [0.02] * 3, "plastic", black, 6))
-    parts.append(tube([(0.1, -0.18, 0.30), (-0.5, -0.2, 0.36), (-0.85, -0.2, 0.42)], [0.04, 0.05, 0.06], "chrome", (0.6, 0.6, 0.6), 7))
-    parts.append(ellipsoid((0.58, 0, 0.92), (0.08, 0.10, 0.10), "headlamp", (0.75, 0.75, 0.75), 6))
-    parts.append(box((-0.92, 0, 0.82), (0.04, 0.16, 0.06), "tail_lamp", (0.4, 0.01, 0.01)))
-    parts.append(box((-0.96, 0, 0.68), (0.02, 0.2, 0.16), "plate", (0.6, 0.6, 0.6)))
-    return Mesh.join(parts)
-
-
-def motorcyclist(style: PersonStyle, colour: Colour) -> Mesh:
-    """A motorcycle with its rider in a helmet."""
-    rider = PersonStyle(**{**style.__dict__, "helmet": True, "bag": "none", "clothing": "trousers", "top_material": "leather"})
-    return Mesh.join([motorcycle(colour), dress(riding_pose(0.6, 0.3), rider)])
+    """Somebody seated on a stool."""
+    body = dress(sitting_pose(), PersonStyle(**{**style.__dict__, "helmet": False, "bag": "none"}))
+    dark = (0.1, 0.1, 0.1)
+    feet = [(x, y, 0.2) for x in (-0.12, 0.2) for y in (-0.14, 0.14)]
+    legs = [box(foot, (0.03, 0.03, 0.4), "galvanised", dark) for foot in feet]
+    return Mesh.join([body, box((0.04, 0, 0.405), (0.38, 0.36, 0.03), "wood", (0.28, 0.17, 0.09)), *legs])

@@ -266,9 +266,19 @@ def wheel(x: float, y: float, radius: float, width: float, side: float, rim_colo
         along = np.array([np.cos(a), 0, np.sin(a)])
         across = np.array([-np.sin(a), 0, np.cos(a)]) * radius * 0.15
         at = offset * 0.98
-        spokes.append(quad(at - across * 1.2, at + across * 1.2, at + along * radius * 0.66 + across,
-                           at + along * radius * 0.66 - across))
+        spokes.append(
+            quad(
+                at - across * 1.2,
+                at + across * 1.2,
+                at + along * radius * 0.66 + across,
+                at + along * radius * 0.66 - across,
+            )
+        )
     face = make_mesh(np.concatenate(spokes), "rim", rim_colour)
-    ring = grid(np.stack([circle * radius * 0.70 + offset * 0.99, circle * radius * 0.60 + offset * 0.99])[:, order],
-                "rim", rim_colour, closed=True)
+    ring = grid(
+        np.stack([circle * radius * 0.70 + offset * 0.99, circle * radius * 0.60 + offset * 0.99])[:, order],
+        "rim",
+        rim_colour,
+        closed=True,
+    )
     return Mesh.join([tyre, barrel, face, ring]).moved((x, y, radius))

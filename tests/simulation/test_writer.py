@@ -1,0 +1,209 @@
+import errno
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from lcf3d.datasets.kitti import KittiDataset
+from lcf3d.datasets.kitti_check import check_kitti
+from lcf3d.datasets.nuscenes import NuscenesDataset
+from lcf3d.datasets.nuscenes_check import check_nuscenes
+from lcf3d.errors import ConfigError, DatasetError, MissingExtraError
+from lcf3d.formats.kitti import read_objects
+from lcf3d.geometry.boxes import points_in_boxes
+from lcf3d.simulation import kitti_layout, writer
+from lcf3d.simulation.frames import simulate_drive
+from lcf3d.simulation.writer import Recipe, write_dataset
+
+from .conftest import shrink_presets
+
+
+def contents(root):
+    return {p.relative_to(root).as_posix(): p.read_bytes() for p in sorted(root.rglob("*")) if p.is_file()}
+
+
+RECIPE = Recipe("kitti64", 5, seed=1, sequence=True, street="residential")
+
+
+@pytest.fixture(scope="session")
+def kitti(tmp_path_factory):
+    """A drive of five small frames, written once."""
+    root = tmp_path_factory.mktemp("simulated") / "kitti"
+    with pytest.MonkeyPatch.context() as patch:
+        shrink_presets(patch)
+        write_dataset(RECIPE, root)
+    return root
+
+
+def test_the_kitti_reader_finds_what_was_simulated(kitti, tiny_presets):
+    dataset = KittiDataset(kitti, image_size=(248, 75))
+    assert dataset.ids == tuple(f"{k:06d}" for k in range(5))
+    for index in (0, 4):
+        frame = dataset[index]
+        expected = next(simulate_drive("kitti64", 1, 5, street="residential", first=index))
+        np.testing.assert_array_equal(frame.points, expected.scan.points)
+        np.testing.assert_array_equal(frame.images["right"], expected.renders["right"].image)
+        np.testing.assert_allclose(frame.labels.boxes, expected.labels.boxes, atol=2e-3)
+        for mine, theirs in zip(frame.cameras, expected.preset.cameras, strict=True):
+            np.testing.assert_allclose(mine.pixels_from_lidar, theirs.pixels_from_lidar, atol=1e-6)
+
+
+def test_instance_ids_and_tracks_belong_to_the_label_lines(kitti):
+    for k in range(5):
+        objects = read_objects(kitti / "training" / "label_2" / f"{k:06d}.txt", results=False)
+        tracks = [int(t) for t in (kitti / "training" / "tracks" / f"{k:06d}.txt").read_text().split()]
+        ids = np.array(Image.open(kitti / "training" / "instance_2" / f"{k:06d}.png"))
+        assert ids.dtype == np.uint16
+        assert len(tracks) == len(objects)
+        for track, box in zip(tracks, objects.boxes2d, strict=True):
+            rows, columns = np.nonzero(ids == track)
+            assert box.tolist() == [columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]
+
+
+def test_the_splits_share_no_frame(kitti):
+    train, val = ((kitti / "ImageSets" / f"{s}.txt").read_text().split() for s in ("train", "val"))
+    assert sorted(train + val) == [f"{k:06d}" for k in range(5)]
+    assert val == ["000004"]
+
+
+def test_whole_drives_belong_to_one_split(tmp_path):
+    ids = [f"{k:06d}" for k in range(50)]
+    kitti_layout.write_splits(tmp_path, ids, 10)
+    assert (tmp_path / "ImageSets" / "val.txt").read_text().split() == ids[40:]
+
+
+def test_the_sanity_rules_hold_at_full_size(tmp_path):
+    write_dataset(Recipe("kitti64", 1, seed=4, street="city"), tmp_path / "k")
+    assert check_kitti(KittiDataset(tmp_path / "k")) == []
+
+
+def test_nuscenes_reader_finds_what_was_simulated(tmp_path, tiny_presets):
+    root = tmp_path / "nuscenes"
+    recipe = Recipe("nuscenes32", 2, seed=2, sequence=True, street="residential")
+    assert write_dataset(recipe, root) == ["0000_0000", "0000_0001"]
+    assert check_nuscenes(root) == []
+    dataset = NuscenesDataset(root)
+    simulated = list(simulate_drive("nuscenes32", 2, 2, street="residential"))
+    for frame, expected in zip(dataset, simulated, strict=True):
+        np.testing.assert_allclose(frame.points[:, :3], expected.scan.points[:, :3], atol=1e-4)
+        assert frame.points[:, 3].max() > 1
+        ours = expected.labels
+        assert len(frame.labels) == len(ours)
+        order = [np.abs(ours.boxes[:, :3] - box[:3]).sum(axis=1).argmin() for box in frame.labels.boxes]
+        np.testing.assert_allclose(frame.labels.boxes[:, :6], ours.boxes[order][:, :6], atol=1e-3)
+        turn = frame.labels.boxes[:, 6] - ours.boxes[order][:, 6]
+        np.testing.assert_allclose(np.cos(turn), 1, atol=1e-6)
+        assert frame.labels.labels.tolist() == ours.labels[order].tolist()
+        assert frame.labels.attributes.tolist() == ours.attributes[order].tolist()
+        known = np.isfinite(frame.labels.velocities).all(axis=1)  # an object seen once has no difference to take
+        assert known.mean() > 0.5
+        np.testing.assert_allclose(frame.labels.velocities[known], ours.velocities[order][known], atol=0.25)
+        theirs = {camera.name: camera for camera in expected.preset.cameras}
+        for mine in frame.cameras:
+            np.testing.assert_allclose(
+                mine.pixels_from_lidar, theirs[mine.name].pixels_from_lidar, rtol=1e-6, atol=1e-3
+            )
+    annotations = json.loads((root / "v1.0-simulated" / "sample_annotation.json").read_text())
+    inside = points_in_boxes(simulated[0].scan.points, simulated[0].boxes).sum(axis=1)
+    first = [a["num_lidar_pts"] for a in annotations if a["sample_token"] == dataset.ids[0]]
+    assert sorted(first) == sorted(n for n in inside.tolist() if n)[-len(first) :] or set(first) <= set(inside.tolist())
+    assert {a["visibility_token"] for a in annotations} <= {"1", "2", "3", "4"}
+
+
+def test_a_folder_that_is_not_empty_is_refused(tmp_path, tiny_presets):
+    (tmp_path / "note.txt").write_text("mine")
+    with pytest.raises(ConfigError, match="is not empty"):
+        write_dataset(Recipe("kitti64", 1), tmp_path)
+    with pytest.raises(ConfigError, match=r"holds no simulation\.json"):
+        write_dataset(Recipe("kitti64", 1), tmp_path, resume=True)
+    with pytest.raises(ConfigError, match="is a file"):
+        write_dataset(Recipe("kitti64", 1), tmp_path / "note.txt")
+    assert contents(tmp_path) == {"note.txt": b"mine"}
+
+
+def test_resume_refuses_other_settings(kitti, tiny_presets):
+    with pytest.raises(ConfigError, match="other settings"):
+        write_dataset(replace(RECIPE, seed=2), kitti, resume=True)
+
+
+def test_an_interrupted_run_goes_on_to_the_same_bytes(tmp_path, kitti, tiny_presets, monkeypatch):
+    recipe, root = RECIPE, tmp_path / "cut"
+    original, written = kitti_layout.write_png, []
+
+    def interrupted(path, image):
+        if len(written) == 8:
+            raise KeyboardInterrupt
+        written.append(path)
+        original(path, image)
+
+    monkeypatch.setattr(kitti_layout, "write_png", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        write_dataset(recipe, root)
+    monkeypatch.setattr(kitti_layout, "write_png", original)
+    assert not list(root.rglob("*.tmp*"))
+    steps = []
+    write_dataset(recipe, root, resume=True, progress=steps.append)
+    assert steps[0] == 2  # two frames were whole
+    assert sum(steps) == 5
+    assert contents(root) == contents(kitti)
+
+
+def test_a_full_disk_leaves_only_whole_files(tmp_path, tiny_presets, monkeypatch):
+    def full(path, image):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    root = tmp_path / "full"
+    with monkeypatch.context() as patch:
+        patch.setattr(kitti_layout, "write_png", full)
+        with pytest.raises(DatasetError, match="No space left on device"):
+            write_dataset(Recipe("kitti64", 1), root)
+    assert not kitti_layout.is_complete(root, "000000")
+    assert not list(root.rglob("*.tmp*"))
+    write_dataset(Recipe("kitti64", 1), root, resume=True)
+    assert kitti_layout.is_complete(root, "000000")
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"preset": "kitti", "frames": 1}, "unknown preset 'kitti'"),
+        ({"preset": "kitti64", "frames": 0}, "frames must be 1 or more"),
+        ({"preset": "kitti64", "frames": 1, "street": "x"}, "unknown street 'x'"),
+    ],
+)
+def test_bad_recipes_are_refused(settings, message):
+    with pytest.raises(ConfigError, match=message):
+        Recipe(**settings)
+
+
+def test_bad_jobs_and_a_missing_package_are_refused(tmp_path, monkeypatch):
+    with pytest.raises(ConfigError, match="jobs must be 1 or more"):
+        write_dataset(Recipe("kitti64", 1), tmp_path / "a", jobs=0)
+    monkeypatch.setattr(writer, "find_spec", lambda _: None)
+    with pytest.raises(MissingExtraError, match=r"lcf3d\[simulate\]"):
+        write_dataset(Recipe("kitti64", 1), tmp_path / "a")
+    assert not (tmp_path / "a").exists()
+
+
+def test_long_sequences_are_cut_into_drives():
+    recipe = Recipe("nuscenes32", 90, sequence=True)
+    assert recipe.drive_frames == 40
+    assert recipe.place(85) == (2, 5)
+    assert recipe.frames_of(2) == 10
+    assert recipe.id(85) == "0002_0005"
+    assert Recipe("kitti64", 3).id(2) == "000002"
+
+
+def test_the_command_writes_a_data_set_and_refuses_bad_input(tmp_path, tiny_presets):
+    from typer.testing import CliRunner
+
+    from lcf3d.cli.app import app
+
+    runner = CliRunner()
+    result = runner.invoke(app, ["simulate", str(tmp_path / "out"), "--frames", "1", "--preset", "sparse16"])
+    assert result.exit_code == 0, result.output
+    assert (tmp_path / "out" / "training" / "label_2" / "000000.txt").exists()
+    again = runner.invoke(app, ["simulate", str(tmp_path / "out"), "--frames", "1", "--preset", "sparse16"])
+    assert isinstance(again.exception, ConfigError)
