@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from multiprocessing import get_context
 from time import perf_counter
 from typing import Any, Protocol
@@ -76,7 +76,7 @@ class FrameRunner:
         marks.append(perf_counter())
         camera = self.detect_cameras(frame)
         marks.append(perf_counter())
-        fused = self.fusion(frame, lidar, camera)
+        fused = self._with_absent_cameras(self.fusion(frame, lidar, camera), frame)
         marks.append(perf_counter())
         self.folder.write(frame, fused)
         marks.append(perf_counter())
@@ -84,19 +84,31 @@ class FrameRunner:
         spent = {name: (b - a) * 1e3 for name, a, b in zip(parts, marks[:-1], marks[1:], strict=True)}
         return summarize(frame_id, fused, spent)
 
+    def _with_absent_cameras(self, fused: FusedDetections, frame: Frame) -> FusedDetections:
+        """The same with a note on each camera that the run uses and the dataset left out of this frame."""
+        there = {camera.name for camera in frame.cameras}
+        notes = [
+            f"camera {name} is missing from this frame or too far off in time and was not used: nobody looked there"
+            for name in self.cameras
+            if name not in there
+        ]
+        return replace(fused, notes=(*fused.notes, *notes)) if notes else fused
+
     def detect_cameras(self, frame: Frame) -> dict[str, Detections2D]:
         """2D detections of every camera that the frame has and that can be looked through.
 
+        None where the dataset left all cameras out of the frame: the LiDAR branch then stands alone.
+
         Raises:
-            DatasetError: that is none of them.
+            DatasetError: there are cameras, but nothing to detect from in any of them.
         """
-        there = {camera.name for camera in frame.cameras}
+        there = {camera.name for camera in frame.cameras} & set(self.cameras)
         found = {
             name: source.detect(frame, name)
             for name, source in self.cameras.items()
             if name in there and source.sees(frame, name)
         }
-        if not found:
+        if there and not found:
             raise DatasetError(
                 f"frame {frame.id} has no image of {' or '.join(self.cameras)}; pass results:PATH as the camera branch"
             )

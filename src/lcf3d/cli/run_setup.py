@@ -191,7 +191,8 @@ def _calibration(
     for frame_id in chosen:
         frame = runner.dataset.frame(frame_id)
         found = runner.detect_cameras(frame)
-        teaching.append((frame, runner.lidar.detect(frame), next(iter(found.values()))))
+        if found:
+            teaching.append((frame, runner.lidar.detect(frame), next(iter(found.values()))))
     calibration = self_calibrate(teaching, config)
     if len(chosen) < FEW_FRAMES:
         calibration = calibration.model_copy(update={"camera_classes": None})
