@@ -22,6 +22,7 @@ VERBS: dict[str, str] = {
     "models": "models",
     "calibrate": "calibrate",
     "ablate": "ablate",
+    "generalize": "generalize",
 }
 
 app = typer.Typer(
