@@ -12,7 +12,9 @@ torch = pytest.importorskip("torch")
 from lcf3d.detectors.lidar.fusing import fuse_batch_norm  # noqa: E402
 from lcf3d.detectors.lidar.point_ops import (  # noqa: E402
     ball_query,
+    ball_query_in_torch,
     bilinear,
+    farthest_in_torch,
     farthest_point_sampling,
     three_nn_interpolation,
 )
@@ -105,6 +107,15 @@ def test_ball_query_takes_the_first_in_order():
     centers = torch.tensor([[0.0, 0, 0], [9, 0, 0], [50, 0, 0]])
     assert ball_query(centers, points, 1.0, 2).tolist() == [[0, 2], [1, 1], [-1, -1]]
     assert ball_query(centers[:1], points, 1.0, 6).tolist() == [[0, 2, 3, 0, 0, 0]]
+
+
+def test_the_compiled_and_the_vectorised_forms_agree():
+    generator = torch.Generator().manual_seed(5)
+    points, centers = (torch.randn(n, 3, generator=generator) for n in (700, 90))
+    for radius, count in ((0.2, 4), (0.9, 16), (9.0, 800)):
+        expected = ball_query_in_torch(centers, points, radius, count)
+        assert torch.equal(ball_query(centers, points, radius, count), expected)
+    assert torch.equal(farthest_point_sampling(points, 64), farthest_in_torch(points, 64))
 
 
 def test_three_nearest_neighbours_by_hand():

@@ -347,14 +347,3 @@ def find_style(state: Mapping[str, Any]) -> Style:
             return style
     known = ", ".join(f"{name}: {len(s.classes)} and {len(s.ratios)}" for name, s in STYLES.items())
     raise DetectorError(f"no Faster R-CNN with {classes} classes and {anchors} anchors a cell is known ({known})")
-
-
-def torchvision_fasterrcnn(
-    path: str,
-    class_names: Sequence[str] | None = None,
-    score_threshold: float = 0.05,
-    style: str | None = None,
-    device: str = "cpu",
-) -> TorchvisionFasterRCNN:
-    """``fasterrcnn:CHECKPOINT`` of the command line."""
-    return TorchvisionFasterRCNN(path, class_names, score_threshold, style, device)

@@ -1,4 +1,4 @@
-"""The one place where the LiDAR networks import torch, with a sentence saying what to install where it is absent."""
+"""The one place where the networks import torch, with a sentence saying what to install where it is absent."""
 
 from lcf3d.errors import MissingExtraError
 
@@ -9,6 +9,6 @@ try:
 except ModuleNotFoundError as error:
     if error.name != "torch":
         raise
-    raise MissingExtraError("torch", "train", "a LiDAR network in torch") from None
+    raise MissingExtraError("torch", "train", "a network in torch") from None
 
 __all__ = ["Tensor", "functional", "nn", "torch"]

@@ -51,7 +51,7 @@ class TorchLidarDetector(ABC):
         self.nms = nms
         self.score_threshold = config.suppression.score_threshold if score_threshold is None else score_threshold
         self.device = torch.device(device)
-        self.network = network.eval().requires_grad_(False).to(self.device)
+        self.network = channels_innermost(network.eval().requires_grad_(False).to(self.device))
 
     @classmethod
     def build(cls, config: LidarConfig) -> nn.Module:
@@ -141,6 +141,14 @@ class PillarDetector(OneStageDetector):
     def inputs(self, points: NDArray[np.floating]) -> Inputs | None:
         """See `pillar_inputs`."""
         return pillar_inputs(points, self.config)
+
+
+def channels_innermost(network: nn.Module) -> nn.Module:
+    """``network`` with the weights of its 2D convolutions laid out for maps whose channels are innermost in memory."""
+    for module in network.modules():
+        if isinstance(module, (nn.Conv2d, nn.ConvTranspose2d)):
+            module.to(memory_format=torch.channels_last)
+    return network
 
 
 def to_arrays(maps: Any) -> Any:

@@ -73,4 +73,5 @@ def scatter_pillars(features: Tensor, cells: Tensor, height: int, width: int) ->
     """(1, C, H, W) map with the (P, C) features at the (P,) int64 flat cells and zero elsewhere."""
     canvas = features.new_zeros(height * width, features.shape[1])
     canvas = canvas.index_put((cells,), features)
-    return canvas.t().reshape(1, features.shape[1], height, width)
+    # channels stay innermost in memory, which convolutions on a CPU prefer
+    return canvas.reshape(1, height, width, -1).permute(0, 3, 1, 2)

@@ -26,7 +26,7 @@ from lcf3d.detectors.lidar.roi import (
     propose,
     refine,
 )
-from lcf3d.detectors.lidar.sparse import Sites, SparseBlock, SparseTensor, SubmanifoldConv
+from lcf3d.detectors.lidar.sparse import Sites, SparseBlock, SparseTensor, SubmanifoldConv, swap_table
 from lcf3d.detectors.lidar.sparse_encoders import sparse_shape
 from lcf3d.detectors.lidar.sparse_unet import SparseUNet
 from lcf3d.detectors.lidar.suppression import bev_nms, suppression_threshold
@@ -67,9 +67,9 @@ class DownConv(nn.Module):
         """Features of 256 channels on a grid of half the size."""
         for block in self.merge_conv:
             x = block(x)
-        sites, pairs = x.sites.strided_pairs((2, 2, 2), (2, 2, 2), (0, 0, 0))
-        source, target = (torch.cat(indices) for indices in zip(*pairs, strict=True))
-        x = SparseTensor(pooled_maximum(x.features[source], target, len(sites)), sites)
+        sites, table = x.sites.strided_table((2, 2, 2), (2, 2, 2), (0, 0, 0))
+        padded = torch.cat([x.features, torch.full_like(x.features[:1], -torch.inf)])
+        x = SparseTensor(padded[swap_table(table, len(sites))].amax(dim=1), sites)
         for block in self.down_conv:
             x = block(x)
         return x

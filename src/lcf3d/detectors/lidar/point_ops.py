@@ -1,11 +1,52 @@
-"""Operations on point sets, vectorised in torch: sampling, neighbours, interpolation (PointNet++, section 3)."""
+"""Operations on point sets: sampling, neighbours, interpolation (PointNet++, section 3).
+
+On a CPU, sampling and neighbour search are loops compiled by numba, which stop as soon as they have enough; elsewhere
+they are vectorised in torch. Both give the same indices.
+"""
 
 from __future__ import annotations
+
+import numpy as np
+from numba import njit
 
 from lcf3d.detectors.lidar._torch import Tensor, torch
 
 CHUNK = 4_000_000
 """Pairwise distances computed at once."""
+
+
+@njit(cache=True, nogil=True)
+def _farthest(points, count):  # type: ignore[no-untyped-def]
+    distance = np.full(len(points), np.inf, np.float32)
+    chosen = np.zeros(count, np.int64)
+    for i in range(1, count):
+        x, y, z = points[chosen[i - 1]]
+        best, farthest = np.float32(-1), 0
+        for j in range(len(points)):
+            dx, dy, dz = points[j, 0] - x, points[j, 1] - y, points[j, 2] - z
+            distance[j] = min(distance[j], dx * dx + dy * dy + dz * dz)
+            if distance[j] > best:
+                best, farthest = distance[j], j
+        chosen[i] = farthest
+    return chosen
+
+
+@njit(cache=True, nogil=True)
+def _first_within(centers, points, squared_radius, count):  # type: ignore[no-untyped-def]
+    found = np.full((len(centers), count), -1, np.int64)
+    for i in range(len(centers)):
+        x, y, z = centers[i]
+        n = 0
+        for j in range(len(points)):
+            dx, dy, dz = points[j, 0] - x, points[j, 1] - y, points[j, 2] - z
+            if dx * dx + dy * dy + dz * dz < squared_radius:
+                found[i, n] = j
+                n += 1
+                if n == count:
+                    break
+        for k in range(n, count):
+            found[i, k] = found[i, 0]
+    return found
 
 
 def farthest_point_sampling(points: Tensor, count: int) -> Tensor:
@@ -17,15 +58,29 @@ def farthest_point_sampling(points: Tensor, count: int) -> Tensor:
         points: (N, 3), at least one.
         count: how many to choose.
     """
-    chosen = torch.zeros(min(count, len(points)), dtype=torch.int64, device=points.device)
+    distinct = min(count, len(points))
+    if points.device.type == "cpu":
+        chosen = torch.from_numpy(_farthest(_array(points), distinct))
+    else:
+        chosen = farthest_in_torch(points, distinct)
+    return chosen.repeat(-(-count // distinct))[:count]
+
+
+def farthest_in_torch(points: Tensor, count: int) -> Tensor:
+    """(count,) indices of at most N farthest points, see `farthest_point_sampling`."""
+    chosen = torch.zeros(count, dtype=torch.int64, device=points.device)
     distance = torch.full((len(points),), float("inf"), device=points.device)
     columns = points.t().contiguous()
-    for i in range(1, len(chosen)):
+    for i in range(1, count):
         last = columns[:, chosen[i - 1], None]
         distance = torch.minimum(distance, (columns - last).square_().sum(dim=0))
         chosen[i] = distance.argmax()
-    repeats = -(-count // len(chosen))
-    return chosen.repeat(repeats)[:count]
+    return chosen
+
+
+def _array(points: Tensor) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]]:
+    array: np.ndarray[tuple[int, ...], np.dtype[np.float32]] = points.detach().float().contiguous().numpy()
+    return array
 
 
 def squared_distances(a: Tensor, b: Tensor) -> Tensor:
@@ -41,6 +96,14 @@ def ball_query(centers: Tensor, points: Tensor, radius: float, count: int) -> Te
 
     Fewer points than ``count`` are filled up with the first of them.
     """
+    if points.device.type == "cpu":
+        squared = np.float32(radius) * np.float32(radius)
+        return torch.from_numpy(_first_within(_array(centers), _array(points), squared, count))
+    return ball_query_in_torch(centers, points, radius, count)
+
+
+def ball_query_in_torch(centers: Tensor, points: Tensor, radius: float, count: int) -> Tensor:
+    """(M, count) indices, see `ball_query`."""
     rows = max(1, CHUNK // max(1, len(points)))
     taken = min(count, len(points))
     order = torch.arange(len(points), device=points.device, dtype=torch.int32)

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from lcf3d.detectors.lidar._torch import Tensor, nn, torch
+from lcf3d.detectors.lidar._torch import Tensor, functional, nn, torch
 from lcf3d.detectors.lidar.backbones import ConvModule
 from lcf3d.detectors.lidar.point_ops import ball_query
 
@@ -38,7 +38,18 @@ class SetAbstraction(nn.Module):
             index = ball_query(centers, positions, radius, count)
             empty = index[:, 0] < 0
             index = index.clamp(min=0)
-            grouped = torch.cat([positions[index] - centers[:, None], features[index]], dim=2)
+            # the first layer is linear: a point's features go through it once, not once for each neighbourhood
+            weight = mlp.layer0.conv.weight[:, :, 0, 0]
+            offsets = positions[index] - centers[:, None]
+            grouped = (features @ weight[:, 3:].t())[index] + offsets @ weight[:, :3].t()
             grouped[empty] = 0
-            outputs.append(mlp(grouped.permute(2, 0, 1)[None]).amax(dim=3)[0].t())
+            if mlp.layer0.conv.bias is not None:
+                grouped += mlp.layer0.conv.bias
+            hidden = functional.relu_(mlp.layer0.bn(as_map(grouped)))
+            outputs.append(mlp.layer1(hidden).reshape(len(centers), count, -1).amax(dim=1))
         return torch.cat(outputs, dim=1)
+
+
+def as_map(values: Tensor) -> Tensor:
+    """(..., C) values as a (N, C, 1, 1) map for layers of two dimensions."""
+    return values.reshape(-1, values.shape[-1], 1, 1)

@@ -1,4 +1,4 @@
-"""Sparse 3D convolution in plain torch: for each kernel offset gather the inputs, multiply, add to the outputs.
+"""Sparse 3D convolution in plain torch: gather the inputs of every output, multiply with the kernel.
 
 Sites (the active cells) know which input meets which output at every kernel offset; this is worked out once and shared
 by all convolutions between the same sites. Weights are (kz, ky, kx, in, out).
@@ -7,15 +7,14 @@ by all convolutions between the same sites. Weights are (kz, ky, kx, in, out).
 # mypy: allow-subclassing-any
 from __future__ import annotations
 
-import itertools
-from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from lcf3d.detectors.lidar._torch import Tensor, functional, nn, torch
 
 Triple = tuple[int, int, int]
-Pairs = list[tuple[Tensor, Tensor]]
-"""For each kernel offset, in row-major order, indices of the input and of the output sites that it connects."""
+GATHERED = 1 << 22
+"""Numbers gathered at once; more rows than fit are taken in turns."""
 
 
 class Sites:
@@ -30,8 +29,8 @@ class Sites:
         self.coordinates = coordinates
         self.shape = shape
         self._sorted_keys, self._order = torch.sort(flat_keys(coordinates, shape))
-        self._submanifold: dict[Triple, Pairs] = {}
-        self._strided: dict[tuple[Triple, Triple, Triple], tuple[Sites, Pairs]] = {}
+        self._submanifold: dict[Triple, Tensor] = {}
+        self._strided: dict[tuple[Triple, Triple, Triple], tuple[Sites, Tensor]] = {}
 
     def __len__(self) -> int:
         return len(self.coordinates)
@@ -43,63 +42,70 @@ class Sites:
         position = torch.searchsorted(self._sorted_keys, keys).clamp_(max=len(self) - 1)
         return torch.where(self._sorted_keys[position] == keys, self._order[position], -1)
 
-    def submanifold_pairs(self, kernel: Triple) -> Pairs:
-        """Pairs of a convolution whose outputs are these same sites (odd kernel, stride 1)."""
+    def submanifold_table(self, kernel: Triple) -> Tensor:
+        """(N, K) input of each site at each offset of an odd kernel; N where there is none."""
         if kernel not in self._submanifold:
-            offsets = list(itertools.product(*(range(k) for k in kernel)))
-            center = len(offsets) // 2
-            everything = torch.arange(len(self), device=self.coordinates.device)
-            first_half: Pairs = []
-            for offset in offsets[:center]:
-                step = [o - k // 2 for o, k in zip(offset, kernel, strict=True)]
-                first_half.append(self._neighbours(step, everything))
+            offsets = kernel_offsets(kernel, self.coordinates.device)
+            half = len(offsets) // 2
+            steps = offsets[:half] - torch.tensor(kernel, device=offsets.device) // 2
+            cells = self.coordinates[None].repeat(half, 1, 1)
+            cells[:, :, 1:] += steps[:, None]
+            flat = cells.reshape(-1, 4)
+            found = torch.where(inside(flat, self.shape), self.find(flat_keys(flat, self.shape)), -1).reshape(half, -1)
+            table = torch.full((len(self), len(offsets)), len(self), device=offsets.device)
+            table[:, half] = torch.arange(len(self), device=offsets.device)
+            offset, output = torch.nonzero(found >= 0, as_tuple=True)
+            source = found[offset, output]
+            table[output, offset] = source
             # offset k from A to B is the mirrored offset from B to A
-            mirrored = [(outputs, inputs) for inputs, outputs in reversed(first_half)]
-            self._submanifold[kernel] = [*first_half, (everything, everything), *mirrored]
+            table[source, len(offsets) - 1 - offset] = output
+            self._submanifold[kernel] = table
         return self._submanifold[kernel]
 
-    def _neighbours(self, step: Sequence[int], everything: Tensor) -> tuple[Tensor, Tensor]:
-        cells = self.coordinates.clone()
-        cells[:, 1:] += torch.tensor(step, device=cells.device)
-        found = torch.where(inside(cells, self.shape), self.find(flat_keys(cells, self.shape)), -1)
-        connected = found >= 0
-        return found[connected], everything[connected]
+    def strided_table(self, kernel: Triple, stride: Triple, padding: Triple) -> tuple[Sites, Tensor]:
+        """Output sites, every cell that an input reaches, and the output of each input at each offset (N, K).
 
-    def strided_pairs(self, kernel: Triple, stride: Triple, padding: Triple) -> tuple[Sites, Pairs]:
-        """Output sites, every cell that an input reaches, and the pairs of a strided convolution."""
+        Where an input reaches none, the table holds the number of outputs.
+        """
         key = (kernel, stride, padding)
         if key not in self._strided:
-            shape = tuple(
-                (n + 2 * p - k) // s + 1 for n, k, s, p in zip(self.shape, kernel, stride, padding, strict=True)
-            )
-            reached = [
-                self._reached(offset, (shape[0], shape[1], shape[2]), stride, padding)
-                for offset in itertools.product(*(range(k) for k in kernel))
-            ]
-            keys, inverse = torch.unique(torch.cat([keys for keys, _ in reached]), return_inverse=True)
-            # outputs stand in the order in which the inputs first reach them, as in the original
-            arrival = torch.cat([inputs * len(reached) + k for k, (_, inputs) in enumerate(reached)])
-            first = torch.full_like(keys, arrival.max() + 1 if len(arrival) else 0)
-            order = first.scatter_reduce(0, inverse, arrival, "amin").argsort()
-            rank = torch.empty_like(order)
-            rank[order] = torch.arange(len(order), device=order.device)
-            keys, inverse = keys[order], rank[inverse]
-            outputs = inverse.split([len(keys) for keys, _ in reached])
-            sites = Sites(coordinates_of(keys, (shape[0], shape[1], shape[2])), (shape[0], shape[1], shape[2]))
-            pairs = [(inputs, output) for (_, inputs), output in zip(reached, outputs, strict=True)]
-            self._strided[key] = (sites, pairs)
+            self._strided[key] = self._stride(kernel, stride, padding)
         return self._strided[key]
 
-    def _reached(self, offset: Sequence[int], shape: Triple, stride: Triple, padding: Triple) -> tuple[Tensor, Tensor]:
-        """Flat keys of the output cells that meet an input at a kernel offset, and the index of that input."""
-        device = self.coordinates.device
-        step = torch.tensor(stride, device=device)
-        cells = self.coordinates.clone()
-        cells[:, 1:] += torch.tensor(padding, device=device) - torch.tensor(offset, device=device)
-        whole = (cells[:, 1:] % step == 0).all(dim=1)
-        cells[:, 1:] = torch.div(cells[:, 1:], step, rounding_mode="floor")
-        inputs = torch.nonzero(whole & inside(cells, shape)).squeeze(1)
-        return flat_keys(cells[inputs], shape), inputs
+    def _stride(self, kernel: Triple, stride: Triple, padding: Triple) -> tuple[Sites, Tensor]:
+        sizes = [(n + 2 * p - k) // s + 1 for n, k, s, p in zip(self.shape, kernel, stride, padding, strict=True)]
+        shape = (sizes[0], sizes[1], sizes[2])
+        offsets = kernel_offsets(kernel, self.coordinates.device)
+        cells = self.coordinates[None].repeat(len(offsets), 1, 1)
+        cells[:, :, 1:] += (torch.tensor(padding, device=offsets.device) - offsets)[:, None]
+        step = torch.tensor(stride, device=offsets.device)
+        whole = (cells[:, :, 1:] % step == 0).all(dim=2)
+        cells[:, :, 1:] = torch.div(cells[:, :, 1:], step, rounding_mode="floor")
+        reached = whole & inside(cells.reshape(-1, 4), shape).reshape(whole.shape)
+        offset, inputs = torch.nonzero(reached, as_tuple=True)
+        keys, inverse = torch.unique(flat_keys(cells[reached], shape), return_inverse=True)
+        # outputs stand in the order in which the inputs first reach them, as in the original
+        arrival = inputs * len(offsets) + offset
+        first = torch.full_like(keys, len(self) * len(offsets)).scatter_reduce(0, inverse, arrival, "amin")
+        order = first.argsort()
+        rank = torch.empty_like(order)
+        rank[order] = torch.arange(len(order), device=order.device)
+        table = torch.full((len(self), len(offsets)), len(order), device=offsets.device)
+        table[inputs, offset] = rank[inverse]
+        return Sites(coordinates_of(keys[order], shape), shape), table
+
+
+def swap_table(table: Tensor, rows: int) -> Tensor:
+    """The table of the opposite direction: (rows, K) from one of N rows with entries below ``rows`` or none."""
+    source, offset = torch.nonzero(table < rows, as_tuple=True)
+    swapped = torch.full((rows, table.shape[1]), len(table), device=table.device)
+    swapped[table[source, offset], offset] = source
+    return swapped
+
+
+def kernel_offsets(kernel: Triple, device: Any) -> Tensor:
+    """(K, 3) offsets of a kernel along z, y, x, in row-major order."""
+    return torch.cartesian_prod(*(torch.arange(k, device=device) for k in kernel)).reshape(-1, 3)
 
 
 def flat_keys(coordinates: Tensor, shape: Triple) -> Tensor:
@@ -142,7 +148,7 @@ class SparseTensor:
 
 
 class SparseConvolution(nn.Module):
-    """Weights of a sparse convolution (kz, ky, kx, in, out) and the gather, multiply, add over its pairs."""
+    """Weights of a sparse convolution (kz, ky, kx, in, out), and the sum over the inputs of each output."""
 
     def __init__(self, in_channels: int, out_channels: int, kernel: Triple = (3, 3, 3)) -> None:
         super().__init__()
@@ -152,16 +158,16 @@ class SparseConvolution(nn.Module):
         if not self.weight.is_meta:
             nn.init.kaiming_uniform_(self.weight.view(-1, out_channels))
 
-    def convolve(self, features: Tensor, pairs: Pairs, outputs: int) -> Tensor:
-        """(outputs, out) sums over the pairs of every kernel offset."""
-        weights = self.weight.reshape(-1, *self.weight.shape[-2:])
-        result = features.new_zeros(outputs, weights.shape[-1])
-        if self.bias is not None:
-            result += self.bias
-        for weight, (source, target) in zip(weights, pairs, strict=True):
-            if len(source):
-                result.index_add_(0, target, features[source] @ weight)
-        return result
+    def convolve(self, features: Tensor, table: Tensor) -> Tensor:
+        """(M, out) sums over the inputs of each output; the (M, K) table holds N where there is none."""
+        weight = self.weight.reshape(-1, self.weight.shape[-1])
+        padded = torch.cat([features, features.new_zeros(1, features.shape[1])])
+        rows = max(1, GATHERED // len(weight))
+        parts = []
+        for chunk in table.split(rows):
+            gathered = padded[chunk.reshape(-1)].reshape(len(chunk), len(weight))
+            parts.append(functional.linear(gathered, weight.t(), self.bias))
+        return torch.cat(parts)
 
 
 class SubmanifoldConv(SparseConvolution):
@@ -169,8 +175,7 @@ class SubmanifoldConv(SparseConvolution):
 
     def forward(self, x: SparseTensor) -> SparseTensor:
         """Features at the same sites."""
-        pairs = x.sites.submanifold_pairs(self.kernel)
-        return x.with_features(self.convolve(x.features, pairs, len(x.sites)))
+        return x.with_features(self.convolve(x.features, x.sites.submanifold_table(self.kernel)))
 
 
 class StridedConv(SparseConvolution):
@@ -190,8 +195,8 @@ class StridedConv(SparseConvolution):
 
     def forward(self, x: SparseTensor) -> SparseTensor:
         """Features at the output sites."""
-        sites, pairs = x.sites.strided_pairs(self.kernel, self.stride, self.padding)
-        return SparseTensor(self.convolve(x.features, pairs, len(sites)), sites)
+        sites, table = x.sites.strided_table(self.kernel, self.stride, self.padding)
+        return SparseTensor(self.convolve(x.features, swap_table(table, len(sites))), sites)
 
 
 class InverseConv(SparseConvolution):
@@ -199,9 +204,8 @@ class InverseConv(SparseConvolution):
 
     def forward(self, x: SparseTensor, fine: Sites, strided: StridedConv) -> SparseTensor:
         """Features at the ``fine`` sites, from which ``strided`` made those of ``x``."""
-        _, pairs = fine.strided_pairs(strided.kernel, strided.stride, strided.padding)
-        swapped = [(outputs, inputs) for inputs, outputs in pairs]
-        return SparseTensor(self.convolve(x.features, swapped, len(fine)), fine)
+        _, table = fine.strided_table(strided.kernel, strided.stride, strided.padding)
+        return SparseTensor(self.convolve(x.features, table), fine)
 
 
 class SparseBlock(nn.Sequential):

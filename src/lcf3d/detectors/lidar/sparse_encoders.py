@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from lcf3d.detectors.lidar._torch import Tensor, nn
+from lcf3d.detectors.lidar._torch import Tensor, nn, torch
 from lcf3d.detectors.lidar.config import VoxelSpec
 from lcf3d.detectors.lidar.sparse import (
     Sites,
@@ -81,7 +81,7 @@ class SparseEncoder(nn.Module):
 
     def flatten(self, x: SparseTensor) -> Tensor:
         """(1, 256, H / 8, W / 8) bird's-eye-view map of the last stage."""
-        return self.conv_out(x).dense().flatten(1, 2)
+        return self.conv_out(x).dense().flatten(1, 2).contiguous(memory_format=torch.channels_last)
 
     def forward(self, features: Tensor, coordinates: Tensor) -> Tensor:
         """(1, 256, H / 8, W / 8) bird's-eye-view map."""
