@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -12,43 +14,51 @@ from lcf3d.errors import ConfigError
 if TYPE_CHECKING:
     from lcf3d.benchmark.timing import Timing
 
-WHAT = ("fusion", "eval")
+SIMULATION_BUDGET_MS = 1000.0
 
 
 def bench(
-    what: Annotated[str, typer.Argument(help=" or ".join(WHAT))] = "fusion",
+    what: Annotated[str, typer.Argument(help="fusion, eval, simulate or detectors")] = "fusion",
     dataset: Annotated[str | None, typer.Option(help="eval: also time this dataset, kitti:ROOT")] = None,
     results: Annotated[Path | None, typer.Option(help="eval: its result folder")] = None,
-    seconds: Annotated[float, typer.Option(help="about how long to measure each figure")] = 1.0,
+    name: Annotated[list[str] | None, typer.Option(help="detectors: only this configuration; repeatable")] = None,
+    seconds: Annotated[float, typer.Option(help="fusion, eval: about how long to measure each figure")] = 1.0,
     json_: Annotated[bool, typer.Option("--json", help="print the figures as JSON")] = False,
 ) -> None:
-    """Measure medians in milliseconds; machines are noisy, so compare ratios of one run.
+    """Measure medians on this machine; machines are noisy, so compare ratios of one run.
 
     Examples:
 
     lcf3d bench fusion
 
     lcf3d bench eval --dataset kitti:KITTI --results runs/pointpillars
+
+    lcf3d bench detectors --name pointpillars-kitti
     """
     import json
-    from dataclasses import asdict
 
-    if what not in WHAT:
-        raise ConfigError(f"bench measures {' or '.join(WHAT)}, got {what!r}")
-    timings = _fusion(seconds) if what == "fusion" else _evaluation(dataset, results, seconds)
+    benches: dict[str, Callable[[], list[dict[str, Any]]]] = {
+        "fusion": lambda: _fusion(seconds),
+        "eval": lambda: _evaluation(dataset, results, seconds),
+        "simulate": _simulation,
+        "detectors": lambda: _detectors(name),
+    }
+    if what not in benches:
+        raise ConfigError(f"bench measures {', '.join(benches)}, got {what!r}")
+    rows = benches[what]()
     if json_:
-        typer.echo(json.dumps([{**asdict(t), "speedup": t.speedup} for t in timings], indent=2))
+        typer.echo(json.dumps(rows, indent=2))
     else:
-        _print(timings)
+        _print(rows)
 
 
-def _fusion(seconds: float) -> list[Timing]:
+def _fusion(seconds: float) -> list[dict[str, Any]]:
     from lcf3d.benchmark.fusion import bench_fusion
 
-    return bench_fusion(seconds)
+    return [_row(timing) for timing in bench_fusion(seconds)]
 
 
-def _evaluation(dataset: str | None, results: Path | None, seconds: float) -> list[Timing]:
+def _evaluation(dataset: str | None, results: Path | None, seconds: float) -> list[dict[str, Any]]:
     from lcf3d.benchmark.evaluation import bench_evaluation
     from lcf3d.datasets.opening import parse_dataset
 
@@ -59,22 +69,49 @@ def _evaluation(dataset: str | None, results: Path | None, seconds: float) -> li
         kind, root = parse_dataset(dataset)
         if kind != "kitti":
             raise ConfigError(f"bench eval times kitti:ROOT, got {dataset!r}")
-    return bench_evaluation(seconds, root, results)
+    return [_row(timing) for timing in bench_evaluation(seconds, root, results)]
 
 
-def _print(timings: list[Timing]) -> None:
+def _simulation() -> list[dict[str, Any]]:
+    from lcf3d.simulation.bench import benchmark
+
+    medians = benchmark()
+    return [
+        {"stage": name, "median_ms": value * 1e3, "budget_ms": SIMULATION_BUDGET_MS if name == "frame" else None}
+        for name, value in medians.items()
+    ]
+
+
+def _detectors(names: list[str] | None) -> list[dict[str, Any]]:
+    from lcf3d.detectors.lidar.benchmarking import benchmark
+
+    return [cost.to_dict() for cost in benchmark(names)]
+
+
+def _row(timing: Timing) -> dict[str, Any]:
+    values = asdict(timing)
+    items = values.pop("items")
+    speed = {"times_faster": timing.speedup, "per_second": 1000 * items / timing.median_ms}
+    return {"stage": values.pop("name"), **values, **speed}
+
+
+def _print(rows: list[dict[str, Any]]) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    table = Table("stage", "median ms", "best ms", "budget ms", "reference ms", "times faster", "a second")
-    for t in timings:
-        table.add_row(
-            t.name,
-            f"{t.median_ms:.3f}",
-            f"{t.best_ms:.3f}",
-            "" if t.budget_ms is None else f"{t.budget_ms:g}",
-            "" if t.reference_ms is None else f"{t.reference_ms:.1f}",
-            "" if t.speedup is None else f"{t.speedup:.0f}",
-            f"{1000 * t.items / t.median_ms:.0f}",
-        )
+    table = Table(*(column.replace("_", " ") for column in rows[0]))
+    for row in rows:
+        table.add_row(*(_text(value) for value in row.values()))
     Console().print(table)
+
+
+def _text(value: Any) -> str:
+    if value is None:
+        return ""
+    return (
+        f"{value:.3g}"
+        if isinstance(value, float) and abs(value) < 100
+        else f"{value:.0f}"
+        if isinstance(value, float)
+        else str(value)
+    )
