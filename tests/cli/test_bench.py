@@ -8,7 +8,7 @@ from lcf3d.errors import Lcf3dError
 
 
 def bench(*arguments):
-    result = CliRunner().invoke(app, ["bench", *arguments])
+    result = CliRunner().invoke(app, ["bench", *arguments], env={"COLUMNS": "200"})
     if result.exception is not None and not isinstance(result.exception, SystemExit):
         raise result.exception
     return result.stdout
