@@ -213,7 +213,8 @@ def reflect(  # type: ignore[no-untyped-def]
         elif table[m, 4] == 6:
             cosine = 0.35 + 0.65 * cosine
             reflectance *= 0.6 + 0.8 * seed[t]
-        value = reflectance * (0.55 + 0.45 * cosine)
+        value = 1.35 * reflectance * (0.60 + 0.40 * cosine)
+        faint = 0.30 if table[m, 4] == 6 else 0.09
         if table[m, 2] > 0:
             value = min(0.99, value * (1 + table[m, 2] * cosine * cosine))
         signal = (
@@ -226,4 +227,5 @@ def reflect(  # type: ignore[no-untyped-def]
         if chance[i, 1] < base_loss or chance[i, 2] > 1 - math.exp(-signal * 4):
             continue
         kept[i] = True
-        intensity[i] = value * (0.85 + 0.3 * chance[i, 2])
+        # real scanners give part of their returns, most of all from leaves, an intensity of zero
+        intensity[i] = 0.0 if chance[i, 0] > 1 - faint else value * (0.85 + 0.3 * chance[i, 2])

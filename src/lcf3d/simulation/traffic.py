@@ -123,9 +123,9 @@ def _vehicle_kind(crowd: Crowd, parked: bool) -> str:
         shares = [0.80, 0.05, 0.08, 0.025, 0.0, 0.02, 0.015, 0.01]
     else:
         shares = (
-            [0.90, 0.06, 0.012, 0.002, 0.0, 0.003, 0.003, 0.02]
+            [0.90, 0.045, 0.010, 0.002, 0.0, 0.003, 0.003, 0.02]
             if parked
-            else [0.80, 0.09, 0.065, 0.015, 0.012, 0.008, 0.0, 0.01]
+            else [0.80, 0.065, 0.035, 0.012, 0.012, 0.006, 0.0, 0.01]
         )
     return str(crowd.rng.choice(kinds, p=np.array(shares) / sum(shares)))
 
@@ -238,6 +238,8 @@ def _people(crowd: Crowd, density: float) -> None:
     for _ in range(_count(rng, street.pedestrians_per_100m * length * density / 1.7)):
         side, way = float(rng.choice([-1.0, 1.0])), float(rng.choice([-1.0, 1.0]))
         s0 = float(rng.uniform(site.first + 5, site.last - 5))
+        if rng.random() < 0.45:  # as for vehicles: recordings were picked for what is near
+            s0 = float(rng.normal(16 + site.travel / 2, 10))
         speed = way * float(rng.uniform(0.9, 1.7)) if rng.random() < 0.78 else 0.0
         turn = 0.0 if speed else float(rng.uniform(-np.pi, np.pi))
         first = street.half_width + float(rng.uniform(0.45, max(0.6, width - 0.4)))
