@@ -77,7 +77,7 @@ def _run(runners: list, names: tuple[str, ...], quiet: bool) -> Results:  # type
     from rich.progress import Progress
 
     results = []
-    with Progress(console=Console(stderr=True), disable=quiet) as progress:
+    with Progress(console=Console(stderr=True), disable=quiet, transient=True) as progress:
         for runner in runners:
             bar = progress.add_task(runner.task.name, total=len(runner))
             results.append((runner.task, runner(names, lambda bar=bar: progress.advance(bar))))
