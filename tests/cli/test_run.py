@@ -6,9 +6,11 @@ from typer.testing import CliRunner
 
 from lcf3d.cli.app import app
 from lcf3d.errors import Lcf3dError
-from lcf3d.formats.kitti import read_objects
+from lcf3d.formats.kitti import objects_from_detections_2d, read_objects, write_objects
 from lcf3d.formats.run_folder import RunFolder
-from tests.datasets.kitti_folder import make_kitti, make_results
+from lcf3d.geometry.camera import project_boxes
+from lcf3d.structures import KITTI_CLASSES, Detections2D
+from tests.datasets.kitti_folder import LABELS, make_kitti, make_results
 
 
 @pytest.fixture
@@ -184,3 +186,45 @@ def test_check_exit_codes(paths):
     bad = lcf3d("check", f"kitti:{paths['root']}", "--split", "val", "--json")
     assert bad.exit_code == 1
     assert json.loads(bad.stdout)[0]["id"] == "KIT01"
+
+
+def test_stereo_pair_of_results(paths, tmp_path):
+    from tests.datasets.kitti_folder import OBJECTS, left_camera, right_camera
+
+    for view, folder in ((left_camera(), "l"), (right_camera(), "r")):
+        boxes, _ = project_boxes(np.array(OBJECTS), view)
+        found = Detections2D(boxes, [0.9, 0.8, 0.85], LABELS, KITTI_CLASSES)
+        for frame_id in ("000000", "000001", "night_7"):
+            write_objects(tmp_path / folder / f"{frame_id}.txt", objects_from_detections_2d(found))
+    result = lcf3d(
+        *("run", f"kitti:{paths['root']}", "--lidar", f"results:{paths['lidar']}", "--out", paths["out"], "--json"),
+        *("--camera-left", f"results:{tmp_path / 'l'}", "--camera-right", f"results:{tmp_path / 'r'}"),
+    )
+    outputs = json.loads(result.stdout)["outputs"]
+    assert outputs["matched"] == {"Car": 3}
+    assert outputs["recovered"] == {"Car": 3, "Pedestrian": 3}
+    assert "epipolar_gate_px" in (paths["out"] / "config.yaml").read_text()
+
+
+@pytest.mark.parametrize(
+    ("cameras", "message"),
+    [
+        ((), "name the camera branch with --camera"),
+        (("--camera-left", "results:x"), "both --camera-left and --camera-right"),
+    ],
+)
+def test_camera_branch_must_be_named(paths, cameras, message):
+    with pytest.raises(Lcf3dError, match=message):
+        lcf3d("run", f"kitti:{paths['root']}", "--lidar", "results:x", "--out", paths["out"], *cameras)
+
+
+def test_scores_without_bounds_are_calibrated_against_the_camera(paths):
+    for path in paths["lidar"].iterdir():
+        path.write_text(path.read_text().replace(" 0.9\n", " 40\n").replace(" 0.8\n", " -3\n"))
+    result = run(paths, "--json")
+    assert "no probabilities" in result.stderr
+    assert (paths["out"] / "calibration.json").is_file()
+    fused = RunFolder(paths["out"]).read("000000")
+    assert (fused.detections.scores <= 1).all()
+    with pytest.raises(Lcf3dError, match="scores must lie in"):
+        run(paths, "--overwrite", "--calibration", "none")

@@ -41,6 +41,10 @@ def left_camera() -> Camera:
     return Camera("left", P2, CAMERA_FROM_LIDAR, *SIZE)
 
 
+def right_camera() -> Camera:
+    return Camera("right", P3, CAMERA_FROM_LIDAR, *SIZE)
+
+
 def make_kitti(root: Path, frame_ids=("000000", "000001", "night_7")) -> Path:
     """Write the folder and return it; see `make_results` for detections that go with it."""
     training = root / "training"

@@ -17,7 +17,7 @@ from lcf3d.datasets.opening import parse_dataset
 from lcf3d.detectors.results import KittiResults, NuscenesCameraResults, NuscenesLidarResults
 from lcf3d.detectors.sources import CameraOnImages, CameraSource, LidarOnScans, LidarSource
 from lcf3d.detectors.specs import load_detector, parse_spec
-from lcf3d.errors import ConfigError
+from lcf3d.errors import ConfigError, DatasetError
 from lcf3d.formats.run_folder import KittiRunFolder, NuscenesRunFolder, RunFolder
 from lcf3d.fusion.calibration import Calibration, load_calibration
 from lcf3d.fusion.config import FusionConfig
@@ -78,6 +78,7 @@ def prepare_run(request: RunRequest, out: Path, *, resume: bool, overwrite: bool
     for source in (lidar, *cameras.values()):
         if isinstance(source, KittiResults):
             source.load(frame_ids)
+    _require_images(dataset, frame_ids, cameras)
     folder = KittiRunFolder(out) if isinstance(dataset, KittiDataset) else NuscenesRunFolder(out, dataset)
     runner = FrameRunner(dataset, lidar, cameras, _fusion(config, None), folder)
     from lcf3d import __version__
@@ -156,6 +157,18 @@ def _camera_source(text: str, request: RunRequest, dataset: Dataset, config: Fus
         defaults["tiles"] = request.tiles
     loaded: Any = load_detector(text, "camera", config.class_names, defaults)
     return loaded if hasattr(loaded, "detect") else CameraOnImages(loaded)
+
+
+def _require_images(dataset: Dataset, frame_ids: Sequence[str], cameras: dict[str, CameraSource]) -> None:
+    """See that every camera asked for by name has an image in some frame, if its detector needs images."""
+    if not isinstance(dataset, KittiDataset):
+        return
+    for name, source in cameras.items():
+        if isinstance(source, CameraOnImages) and not any(name in dataset.image_paths(i) for i in frame_ids):
+            raise DatasetError(
+                f"no frame of the run has an image of the {name} camera in {dataset.folder}; "
+                "add the images, or pass results:DIR as its detector"
+            )
 
 
 def _fusion(config: FusionConfig, calibration: Calibration | None) -> LateCascadeFusion:

@@ -223,15 +223,25 @@ def _write_camera_rows(
 
 
 def _write_recovery_rows(branches: Branches, recovery: Recovery, outputs: IntArray) -> None:
-    """Fill the rows of the 2D detections that were candidates for recovery."""
+    """Fill the rows of the 2D detections that were candidates for recovery, alike for both views of a pair."""
     table = branches.camera_table
     if not len(recovery.camera):
         return
-    starts = np.array(branches.camera_start, dtype=np.int64)
-    rows = np.array(
-        [starts[c] + branches.camera_index[c][d] for c, d in zip(recovery.camera, recovery.detection, strict=True)]
-    )
-    table.reason[rows], table.iou[rows], table.quality[rows] = recovery.reason, recovery.iou, recovery.quality
-    found = recovery.found
-    table.stage[rows[found]] = Stage.RECOVERED
-    table.score[rows[found]], table.output[rows[found]] = recovery.scores[found], outputs
+    output = np.full(len(recovery.camera), -1, dtype=np.int64)
+    output[recovery.found] = outputs
+    first = _camera_rows(branches, recovery.camera, recovery.detection)
+    paired = np.flatnonzero(recovery.second_camera >= 0)
+    second = _camera_rows(branches, recovery.second_camera[paired], recovery.second_detection[paired])
+    table.pair[first[paired]], table.pair[second] = second, first[paired]
+    every = np.arange(len(first))
+    for rows, own, iou in ((first, every, recovery.iou), (second, paired, recovery.second_iou[paired])):
+        table.reason[rows], table.iou[rows], table.quality[rows] = recovery.reason[own], iou, recovery.quality[own]
+        found = output[own] >= 0
+        table.stage[rows[found]] = Stage.RECOVERED
+        table.score[rows[found]], table.output[rows[found]] = recovery.scores[own[found]], output[own[found]]
+
+
+def _camera_rows(branches: Branches, camera: IntArray, detection: IntArray) -> IntArray:
+    """Rows of the camera table of some detections that take part, given by camera and index in it."""
+    rows = [branches.camera_start[c] + branches.camera_index[c][d] for c, d in zip(camera, detection, strict=True)]
+    return np.array(rows, dtype=np.int64)

@@ -161,7 +161,7 @@ class LateCascadeFusion:
         config = self.config
         candidates = []
         for c, (view, found) in enumerate(zip(views, branches.camera, strict=True)):
-            free = np.setdiff1d(np.flatnonzero(found.scores > config.decisive_score), view.match)
+            free = np.setdiff1d(np.arange(len(found)), view.match)
             elsewhere = confirmed_elsewhere(views, matches, clusters, found.boxes[free], c, config.confirm_iou)
             self._mark(branches, c, free[elsewhere], Reason.SEEN_ELSEWHERE)
             candidates.append(free[~elsewhere])
@@ -171,15 +171,18 @@ class LateCascadeFusion:
             points = frame.points
             if points is None:
                 notes.append("there is no scan: unmatched camera detections could not be recovered")
+        pairs = None
         if points is None:
             reason = Reason.NO_SCAN if config.recovery else Reason.NO_RECOVERY
             for c, free in enumerate(candidates):
-                self._mark(branches, c, free, reason)
+                self._mark(branches, c, free[branches.camera[c].scores[free] > config.decisive_score], reason)
             candidates = [free[:0] for free in candidates]
             points = np.zeros((0, 4), np.float32)
-        elif not np.isfinite(points[:, :3].sum(dtype=np.float64)):  # one bad value spoils the sum: a tenth of the time
-            bad = int((~np.isfinite(points[:, :3]).all(axis=1)).sum())
-            notes.append(f"{bad} points of the scan are not finite and were not used")
+        else:
+            if not np.isfinite(points[:, :3].sum(dtype=np.float64)):  # one bad value spoils the sum; ten times quicker
+                bad = int((~np.isfinite(points[:, :3]).all(axis=1)).sum())
+                notes.append(f"{bad} points of the scan are not finite and were not used")
+            candidates, pairs = self._choose_candidates(branches, candidates)
         recovery = recover(
             points,
             branches.cameras,
@@ -193,8 +196,14 @@ class LateCascadeFusion:
             confirm_iou=config.confirm_iou,
             duplicate_iou=config.duplicate_iou,
             min_quality=config.min_quality,
+            pairs=pairs,
         )
         return self._trust_recovered(recovery), notes
+
+    def _choose_candidates(self, branches: Branches, free: list[IntArray]) -> tuple[list[IntArray], IntArray | None]:
+        """For each camera the decisive ones of the 2D detections that show nothing confirmed; and pairs of views."""
+        decisive = [found.scores > self.config.decisive_score for found in branches.camera]
+        return [f[good[f]] for f, good in zip(free, decisive, strict=True)], None
 
     def _trust_recovered(self, recovery: Recovery) -> Recovery:
         """Scores of recovered boxes as probabilities, where those of the others are: see `Evidence`."""

@@ -12,14 +12,13 @@ from lcf3d.errors import ConfigError
 from lcf3d.fusion.branches import Branches
 from lcf3d.fusion.clustering import Clusters
 from lcf3d.fusion.config import PRESETS, FusionConfig
-from lcf3d.fusion.matching import Matches, View, confirmed_elsewhere
+from lcf3d.fusion.matching import Matches, View
 from lcf3d.fusion.outcome import ClusterOutcome
 from lcf3d.fusion.pipeline import LateCascadeFusion
-from lcf3d.fusion.recovery import Recovery, recover
 from lcf3d.fusion.semantic import fuse_scores
 from lcf3d.fusion.stereo_pairing import check_not_exchanged, check_stereo_pair, pair_views
 from lcf3d.localizers.base import Localizer
-from lcf3d.provenance import Decisions, FusedDetections, Reason
+from lcf3d.provenance import FusedDetections, Reason
 from lcf3d.structures import Detections2D, Detections3D, Frame, IntArray
 
 
@@ -97,7 +96,8 @@ class StereoLateCascadeFusion(LateCascadeFusion):
             ConfigError: also for a pair that is not calibrated, has images of different size, or is exchanged.
         """
         fused = super().__call__(frame, lidar, camera)
-        _follow_first_views(fused.camera)
+        table = fused.camera
+        table.reason[(table.reason == Reason.OTHER_VIEW) & (table.pair >= 0)] = Reason.SECOND_VIEW
         return fused
 
     def _prepare(self, frame: Frame, lidar: Detections3D, camera: Mapping[str, Detections2D]) -> Branches:
@@ -168,17 +168,16 @@ class StereoLateCascadeFusion(LateCascadeFusion):
                 outcome.scores[both], found.scores[other], priors[outcome.labels[both]], self.config.ensemble
             )
 
-    def _pair_candidates(self, branches: Branches, candidates: list[IntArray]) -> tuple[list[IntArray], IntArray]:
+    def _choose_candidates(self, branches: Branches, free: list[IntArray]) -> tuple[list[IntArray], IntArray]:
         """Candidates with each pair's second view taken out, and the pairs as `recover` wants them (section 4.2.3).
 
         The more confident detection of a pair comes first and must be decisive. Decisive detections left alone are
         taken out and marked, or stay, as ``unpaired`` says.
         """
-        candidates, rows = list(candidates), [np.zeros((0, 4), dtype=np.int64)]
+        candidates, rows = list(free), [np.zeros((0, 4), dtype=np.int64)]
         decisive = [found.scores > self.config.decisive_score for found in branches.camera]
         for left, right in self._pairs(branches):
-            free = candidates[left], candidates[right]
-            found = branches.camera[left][free[0]], branches.camera[right][free[1]]
+            found = branches.camera[left][free[left]], branches.camera[right][free[right]]
             matched = pair_views(
                 branches.cameras[left],
                 branches.cameras[right],
@@ -188,74 +187,18 @@ class StereoLateCascadeFusion(LateCascadeFusion):
                 decisive_score=self.config.decisive_score,
                 method="paper" if self.config.assignment == "paper" else "gated",
             )
-            own, other = free[0][matched[:, 0]], free[1][matched[:, 1]]
+            own, other = free[left][matched[:, 0]], free[right][matched[:, 1]]
             left_first = found[0].scores[matched[:, 0]] >= found[1].scores[matched[:, 1]]
             forward = np.stack([np.full(len(own), left), own, np.full(len(own), right), other], axis=1)
             rows.append(np.where(left_first[:, None], forward, forward[:, [2, 3, 0, 1]]))
-            for camera, all_free, paired, kept in (
-                (left, free[0], own, left_first),
-                (right, free[1], other, ~left_first),
-            ):
-                alone = np.setdiff1d(all_free, paired)
+            for camera, paired, kept in ((left, own, left_first), (right, other, ~left_first)):
+                alone = np.setdiff1d(free[camera], paired)
                 alone = alone[decisive[camera][alone]]
                 if self.config.unpaired == "discard":
                     self._mark(branches, camera, alone, Reason.UNPAIRED)
                     alone = alone[:0]
                 candidates[camera] = np.sort(np.concatenate([paired[kept], alone]))
         return [c[good[c]] for c, good in zip(candidates, decisive, strict=True)], np.concatenate(rows)
-
-    def _recover(
-        self,
-        frame: Frame,
-        branches: Branches,
-        clusters: Clusters,
-        views: Sequence[View],
-        matches: Matches,
-        outcome: ClusterOutcome,
-    ) -> tuple[Recovery, list[str]]:
-        """Detection recovery (section 4.2.3) of what nothing matched: pairs from both views."""
-        config = self.config
-        candidates = []
-        for c, (view, found) in enumerate(zip(views, branches.camera, strict=True)):
-            free = np.setdiff1d(np.arange(len(found)), view.match)
-            elsewhere = confirmed_elsewhere(views, matches, clusters, found.boxes[free], c, config.confirm_iou)
-            self._mark(branches, c, free[elsewhere], Reason.SEEN_ELSEWHERE)
-            candidates.append(free[~elsewhere])
-        notes: list[str] = []
-        points = None
-        if config.recovery and any(len(c) for c in candidates):
-            points = frame.points
-            if points is None:
-                notes.append("there is no scan: unmatched camera detections could not be recovered")
-        pairs = None
-        if points is None:
-            reason = Reason.NO_SCAN if config.recovery else Reason.NO_RECOVERY
-            for c, free in enumerate(candidates):
-                self._mark(branches, c, free[branches.camera[c].scores[free] > config.decisive_score], reason)
-            candidates = [free[:0] for free in candidates]
-            points = np.zeros((0, 4), np.float32)
-        else:
-            if not np.isfinite(points[:, :3]).all():
-                bad = int((~np.isfinite(points[:, :3]).all(axis=1)).sum())
-                notes.append(f"{bad} points of the scan are not finite and were not used")
-            candidates, pairs = self._pair_candidates(branches, candidates)
-        recovery = recover(
-            points,
-            branches.cameras,
-            branches.camera,
-            candidates,
-            self._confirmed(branches, outcome),
-            self.localizer,
-            enlargement=config.enlargement,
-            min_points=config.min_points,
-            mask_mode=config.mask_mode,
-            confirm_iou=config.confirm_iou,
-            duplicate_iou=config.duplicate_iou,
-            min_quality=config.min_quality,
-            pairs=pairs,
-        )
-        _note_pairs(branches, recovery)
-        return self._trust_recovered(recovery), notes
 
 
 def _rows(branches: Branches, camera: int, detections: IntArray) -> IntArray:
@@ -273,24 +216,3 @@ def _prefer_confident_view(pair: _Pair, branches: Branches, views: Sequence[View
         detection = views[camera].match[rows]
         matches.camera[rows], matches.detection[rows] = camera, detection
         matches.iou[rows] = views[camera].iou[rows, detection]
-
-
-def _note_pairs(branches: Branches, recovery: Recovery) -> None:
-    """Write into the camera table which detections are pairs of recovery, and the overlap in the second view."""
-    for first, second in ((c, c2) for c in range(len(branches.cameras)) for c2 in range(len(branches.cameras))):
-        here = (recovery.camera == first) & (recovery.second_camera == second)
-        rows = _rows(branches, first, recovery.detection[here])
-        other_rows = _rows(branches, second, recovery.second_detection[here])
-        table = branches.camera_table
-        table.pair[rows], table.pair[other_rows] = other_rows, rows
-        table.reason[other_rows], table.iou[other_rows] = Reason.SECOND_VIEW, recovery.second_iou[here]
-
-
-def _follow_first_views(table: Decisions) -> None:
-    """Give the second detection of every pair of recovery the fate of the first; name those that confirm together."""
-    confirming = (table.reason == Reason.OTHER_VIEW) & (table.pair >= 0)
-    following = np.flatnonzero((table.reason == Reason.SECOND_VIEW) & (table.pair >= 0))
-    first = table.pair[following]
-    for column in (table.stage, table.reason, table.quality, table.score, table.output):
-        column[following] = column[first]
-    table.reason[confirming] = Reason.SECOND_VIEW
