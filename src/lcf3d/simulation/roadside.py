@@ -59,7 +59,7 @@ def template(kind: str, variant: int) -> Mesh:
     if kind == "tree":
         return build.tree(8.5, 8.5 * float(rng.uniform(0.5, 0.7)), GREENS[variant % 5], 120, 0.32, rng)
     if kind == "fine_tree":
-        return build.tree(8.5, 8.5 * float(rng.uniform(0.5, 0.7)), GREENS[variant % 5], 700, 0.115, rng)
+        return build.tree(8.5, 8.5 * float(rng.uniform(0.5, 0.7)), GREENS[variant % 5], 480, 0.135, rng)
     if kind == "conifer":
         return build.conifer(9.5, 3.8, (0.035, 0.065, 0.03), 300, rng)
     if kind == "bush":
@@ -67,9 +67,9 @@ def template(kind: str, variant: int) -> Mesh:
     if kind == "hedge":
         return build.hedge(5.0, 1.3, GREENS[variant], rng)
     if kind == "undergrowth":
-        return build.undergrowth(4.4, 5.0, float(rng.uniform(0.9, 2.6)), 450, 0.28, GREENS[variant % 5], rng)
+        return build.undergrowth(4.4, 5.0, float(rng.uniform(0.9, 2.6)), 350, 0.30, GREENS[variant % 5], rng)
     if kind == "fine_undergrowth":
-        return build.undergrowth(4.4, 5.0, float(rng.uniform(0.9, 2.6)), 1900, 0.13, GREENS[variant % 5], rng)
+        return build.undergrowth(4.4, 5.0, float(rng.uniform(0.9, 2.6)), 1500, 0.14, GREENS[variant % 5], rng)
     if kind == "fence":
         return build.fence(5.0, 1.1, variant == 1)
     if kind == "lamp":

@@ -68,7 +68,7 @@ class Site:
 
     def is_near(self, s: float) -> bool:
         """Whether the sensors come so close to arc length ``s`` that single leaves can be told apart."""
-        return -12.0 < s < 32.0 + self.travel
+        return -8.0 < s < 26.0 + self.travel
 
     def near_crossing(self, s: float, margin: float) -> bool:
         """Whether arc length ``s`` lies in a side street or within ``margin`` metres of it."""
@@ -327,9 +327,9 @@ def _front_garden(site: Site, side: float, first: float, last: float, rng: np.ra
 
 def _tree(site: Site, s: float, offset: float, side: float, rng: np.random.Generator, scale: float = 1.0) -> Mesh:
     size = float(rng.uniform(0.7, 1.3)) * scale
-    mesh = any_of("conifer" if rng.random() < 0.15 else "fine_tree" if site.is_near(s) else "tree", rng).scaled(
-        np.array([1, 1, rng.uniform(0.85, 1.15)]) * size
-    )
+    fine = site.is_near(s) and offset < site.building_line + 6.0
+    kind = "conifer" if rng.random() < 0.15 else "fine_tree" if fine else "tree"
+    mesh = any_of(kind, rng).scaled(np.array([1, 1, rng.uniform(0.85, 1.15)]) * size)
     mesh = mesh.placed(0, 0, 0, float(rng.uniform(0, 6.28)))
     return _place(site, mesh, s, offset, side, KERB * 0.7)
 
