@@ -25,6 +25,7 @@ from lcf3d.evaluation.domain_shift import (
     without_ignored,
 )
 from lcf3d.evaluation.domain_tasks import DomainTask, DomainTaskRunner, parse_task
+from lcf3d.evaluation.svg import PALETTE
 from lcf3d.fusion.config import FusionConfig
 from lcf3d.structures import KITTI_CLASSES, NUSCENES_CLASSES, Detections3D, Frame
 from tests.datasets.kitti_folder import OBJECTS, make_kitti, make_results
@@ -287,6 +288,11 @@ def test_four_tasks_end_to_end(folders: dict[str, Path], tmp_path: Path) -> None
     html = (out / "report.html").read_text()
     assert html.count("<svg") == 4
     assert html.count("kitti -&gt; nuscenes") == 1
+    # a training set has one colour in all charts
+    kitti_color, nuscenes_color = PALETTE[:2]
+    for name in drawn:
+        svg = (out / "charts" / name).read_text()
+        assert svg.index(kitti_color) < svg.index("kitti, LiDAR") < svg.index(nuscenes_color)
 
 
 def test_a_detector_of_the_other_data_gets_adapted_points(folders: dict[str, Path], monkeypatch) -> None:
@@ -338,6 +344,7 @@ def test_bad_requests_are_one_sentence(folders: dict[str, Path], tmp_path: Path,
 
     task = task_text(folders, "kitti", "kitti")
     assert "Tram" in sentence("--task", task, "--class", "Tram")
+    assert "two tasks are named 'kitti -> kitti'" in sentence("--task", task, "--task", task)
     assert "the settings have car" in sentence("--task", task, "--config", "nuscenes")
     for path in (folders["kitti"] / "training/label_2").iterdir():
         path.unlink()

@@ -57,7 +57,10 @@ def generalize(
         raise ConfigError(f"{out} is a file; choose a folder for --out")
     settings = build_config(config, list(set_ or ()))
     # everything is opened before anything is run: most mistakes are found at once
-    runners = [DomainTaskRunner(parse_task(text), settings) for text in task]
+    tasks = [parse_task(text) for text in task]
+    if doubles := [t.name for i, t in enumerate(tasks) if t.name in {other.name for other in tasks[:i]}]:
+        raise ConfigError(f"two tasks are named {doubles[0]!r}; tell them apart, for example as kitti-b->kitti")
+    runners = [DomainTaskRunner(parsed, settings) for parsed in tasks]
     results = _run(runners, names, quiet=json_)
     settings.dump(out / "config.yaml")
     write_json(out / "domain_shift.json", to_json(results))

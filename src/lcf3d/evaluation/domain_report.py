@@ -72,10 +72,10 @@ def _curves_json(metrics: ShiftMetrics) -> dict[str, dict[str, float]]:
 def charts(results: Results) -> dict[tuple[str, str], str]:
     """AP over the IoU threshold, one ``<svg>`` by test data and class; LiDAR alone is dashed (paper, same figure)."""
     lines: dict[tuple[str, str], list[Line]] = {}
-    colors: dict[tuple[str, str], str] = {}
+    # one colour a training set, in all charts
+    trained = list(dict.fromkeys(task.trained for task, _ in results))
     for task, methods in results:
-        used = sum(tested == task.tested for tested, _ in colors)
-        color = colors.setdefault((task.tested, task.name), PALETTE[used % len(PALETTE)])
+        color = PALETTE[trained.index(task.trained) % len(PALETTE)]
         for method, metrics in methods.items():
             for name, row in zip(metrics.metrics.class_names, metrics.ap_over_iou, strict=True):
                 line = Line(f"{task.trained}, {method}", IOU_THRESHOLDS, row, color, dashed=method == LIDAR_ALONE)
