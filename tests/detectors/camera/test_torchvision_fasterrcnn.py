@@ -136,3 +136,14 @@ def test_hard_and_soft_selection():
     np.testing.assert_allclose(values, [0.9, 0.8 * (1 - 0.9)])
     none = select_detections(boxes, scores, 0.95, 0.5, soft=True)
     assert none[0].shape == (0, 4)
+
+
+def test_the_cost_of_a_network(monkeypatch):
+    from lcf3d.detectors.camera.torchvision_benchmarking import benchmark_camera
+
+    monkeypatch.setitem(STYLES, "nuscenes", replace(STYLES["nuscenes"], image_size=(128, 128)))
+    (cost,) = benchmark_camera(["fasterrcnn-r50-nuscenes"], np.zeros((9, 16, 3), np.uint8), repeats=1)
+    assert cost.parameters == pytest.approx(41.4, abs=0.1)
+    assert cost.milliseconds > 0
+    with pytest.raises(ConfigError, match="unknown camera network 'yolo'"):
+        benchmark_camera(["yolo"])

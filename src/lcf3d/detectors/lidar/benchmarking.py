@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -27,15 +27,15 @@ from lcf3d.errors import ConfigError
 
 @dataclass(frozen=True)
 class Cost:
-    """One detector's cost for one scan.
+    """One detector's cost for one scan or image.
 
     Attributes:
         name: configuration.
         runtime: ``torch`` or ``onnxruntime``.
         device: where it ran.
-        points: points of the scan in range.
-        milliseconds: median time of a scan, voxelization and suppression included.
-        gflops: multiplications and additions of one scan, in thousand millions; None where not counted.
+        points: points of the scan in range; None for a camera detector.
+        milliseconds: median time, preparation of the input and suppression included.
+        gflops: multiplications and additions, in thousand millions; None where not counted.
         parameters: of the network, in millions.
         peak_memory_mb: memory taken beyond the loaded network, at most; None where the system does not tell.
     """
@@ -43,7 +43,7 @@ class Cost:
     name: str
     runtime: str
     device: str
-    points: int
+    points: int | None
     milliseconds: float
     gflops: float | None
     parameters: float
@@ -80,7 +80,7 @@ def benchmark(
     if unknown:
         raise ConfigError(f"unknown detector {unknown[0]!r}; known: {', '.join(PRESETS)}")
     scan = example_scan() if points is None else points
-    with _threads(threads):
+    with cpu_threads(threads):
         return [cost for name in chosen for cost in _measure(PRESETS[name], scan, repeats, device, threads or 0, onnx)]
 
 
@@ -93,15 +93,15 @@ def _measure(
         raise ConfigError(f"the scan has no point in the range of {config.name}")
     parameters = sum(value.numel() for value in detector.network.parameters()) / 1e6
     count = len(inputs["points"] if "points" in inputs else inputs["features"])
-    memory = _peak_memory_mb(lambda: detector(scan), device)
-    base = Cost(config.name, "torch", device, count, 0.0, _gflops(detector, scan), parameters, memory)
-    costs = [replace(base, milliseconds=_median_ms(lambda: detector(scan), repeats, device))]
+    memory = peak_memory_mb(lambda: detector(scan), device)
+    base = Cost(config.name, "torch", device, count, 0.0, count_gflops(lambda: detector(scan)), parameters, memory)
+    costs = [replace(base, milliseconds=median_ms(lambda: detector(scan), repeats, device))]
     if onnx and isinstance(detector.network, PillarNetwork):
         with tempfile.TemporaryDirectory() as folder:
             export_onnx(detector, Path(folder) / "network.onnx")
             session = OnnxLidarDetector(Path(folder) / "network.onnx", threads=threads)
-            peak = _peak_memory_mb(lambda: session(scan), "cpu")
-            ms = _median_ms(lambda: session(scan), repeats, "cpu")
+            peak = peak_memory_mb(lambda: session(scan), "cpu")
+            ms = median_ms(lambda: session(scan), repeats, "cpu")
         costs.append(replace(base, runtime="onnxruntime", device="cpu", milliseconds=ms, peak_memory_mb=peak))
     return costs
 
@@ -139,7 +139,8 @@ def example_scan(seed: int = 0) -> NDArray[np.float32]:
     return np.stack([*columns, generator.random(len(distance)), np.zeros(len(distance))], axis=1).astype(np.float32)
 
 
-def _median_ms(run: Callable[[], object], repeats: int, device: str) -> float:
+def median_ms(run: Callable[[], object], repeats: int, device: str) -> float:
+    """Median time of ``repeats`` runs, after one that is not timed."""
     run()
     times = []
     for _ in range(repeats):
@@ -151,16 +152,17 @@ def _median_ms(run: Callable[[], object], repeats: int, device: str) -> float:
     return float(np.median(times) * 1e3)
 
 
-def _gflops(detector: TorchLidarDetector, scan: NDArray[np.floating]) -> float:
+def count_gflops(run: Callable[[], object]) -> float:
     """Operations of convolutions and matrix products, a multiplication and an addition counted as two."""
     from torch.utils.flop_counter import FlopCounterMode
 
     with FlopCounterMode(display=False) as counter:
-        detector(scan)
+        run()
     return float(counter.get_total_flops()) / 1e9
 
 
-def _peak_memory_mb(run: Callable[[], object], device: str) -> float | None:
+def peak_memory_mb(run: Callable[[], object], device: str) -> float | None:
+    """Memory that a run takes at most beyond what was taken before it; None where the system does not tell."""
     if device != "cpu":
         torch.cuda.reset_peak_memory_stats()
         before = torch.cuda.memory_allocated()
@@ -184,7 +186,8 @@ def _status_kb(field: str) -> int:
 
 
 @contextmanager
-def _threads(count: int | None) -> Any:
+def cpu_threads(count: int | None) -> Iterator[None]:
+    """torch with so many CPU threads, or as many as before for None."""
     before = torch.get_num_threads()
     if count is not None:
         torch.set_num_threads(count)
