@@ -100,6 +100,20 @@ def test_suppression_modes_are_ordered(small, points):
     assert [suppression_threshold(mode, 0.2) for mode in ("keep", "low", "off")] == [0.2, 0.7, 1.0]
 
 
+def test_more_candidates_on_request(small, points):
+    few = PointPillars(*small, nms="off", score_threshold=0.0, candidates=5)(points)
+    best = PointPillars(*small, nms="off", score_threshold=0.0)(points)
+    assert few.scores.max() == best.scores.max()
+    # each candidate may come out once a class
+    assert len(few) == 15
+    assert len({tuple(box[:3]) for box in few.boxes}) <= 5
+    with pytest.raises(ConfigError, match="candidates must be at least 1"):
+        PointPillars(*small, candidates=0)
+    regions = PRESETS["pv-rcnn-kitti"].with_candidates(200)
+    assert (regions.proposals.max_boxes, regions.proposals.candidates) == (200, 1024)
+    assert PRESETS["centerpoint-voxel01-nuscenes"].with_candidates(700).centers.max_candidates == 700
+
+
 def test_voxels_keep_the_first_points_and_the_first_voxels():
     spec = VoxelSpec((1.0, 1.0, 1.0), (0.0, 0.0, 0.0, 4.0, 4.0, 1.0), max_points=2, max_voxels=2)
     points = np.array(

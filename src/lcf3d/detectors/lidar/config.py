@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
 from lcf3d.errors import ConfigError
@@ -139,6 +139,20 @@ class LidarConfig:
     def has_velocity(self) -> bool:
         """Whether the network predicts velocities."""
         return self.centers is not None or (self.anchors is not None and self.anchors.code_size == 9)
+
+    def with_candidates(self, count: int) -> LidarConfig:
+        """The configuration with ``count`` candidates before suppression (of two-stage networks: regions to refine).
+
+        Raises:
+            ConfigError: ``count`` is not positive.
+        """
+        if count < 1:
+            raise ConfigError(f"candidates must be at least 1, got {count}")
+        if self.proposals is not None:
+            pool = max(count, self.proposals.candidates)
+            return replace(self, proposals=replace(self.proposals, candidates=pool, max_boxes=count))
+        centers = self.centers and replace(self.centers, max_candidates=count)
+        return replace(self, suppression=replace(self.suppression, candidates=count), centers=centers)
 
     def to_dict(self) -> dict[str, Any]:
         """The configuration as plain values, for JSON."""

@@ -29,9 +29,10 @@ class TorchLidarDetector(ABC):
         nms: ``off`` (the paper's choice), ``low`` (only near-copies go) or ``keep`` (the network's own suppression).
         score_threshold: boxes need a higher score; the configuration's own without one.
         device: a torch device, for example ``cpu`` or ``cuda``.
+        candidates: best boxes considered before suppression; the configuration's own number without it.
 
     Raises:
-        ConfigError: ``nms`` or ``score_threshold`` makes no sense.
+        ConfigError: ``nms``, ``score_threshold`` or ``candidates`` makes no sense.
     """
 
     architecture: ClassVar[str]
@@ -43,11 +44,12 @@ class TorchLidarDetector(ABC):
         nms: NmsMode = "keep",
         score_threshold: float | None = None,
         device: str = "cpu",
+        candidates: int | None = None,
     ) -> None:
         suppression_threshold(nms, 0.0)
         if score_threshold is not None and not 0 <= score_threshold < 1:
             raise ConfigError(f"score_threshold must be in [0, 1), got {score_threshold}")
-        self.config = config
+        self.config = config if candidates is None else config.with_candidates(candidates)
         self.nms = nms
         self.score_threshold = config.suppression.score_threshold if score_threshold is None else score_threshold
         self.device = torch.device(device)

@@ -36,6 +36,7 @@ def load(
     score_threshold: float | None = None,
     device: str = "cpu",
     preset: str | None = None,
+    candidates: int | None = None,
     architecture: str | None = None,
 ) -> LidarDetector:
     """A LiDAR detector from a checkpoint of any of the known architectures.
@@ -47,13 +48,14 @@ def load(
         score_threshold: boxes need a higher score; the network's own without it.
         device: torch device.
         preset: name of the configuration; found from the parameters without it.
+        candidates: best boxes considered before suppression; the network's own number without it.
         architecture: what the network must be, if anything.
 
     Raises:
         DetectorError: the file cannot be read, or holds another network.
     """
     state, config = read_lidar_checkpoint(Path(path), preset, architecture)
-    options = {"nms": nms, "score_threshold": score_threshold, "device": device}
+    options = {"nms": nms, "score_threshold": score_threshold, "device": device, "candidates": candidates}
     detector: LidarDetector = detector_class(config.architecture).from_state_dict(state, config, **options)
     return detector if class_names is None else InClasses(detector, tuple(class_names))
 
@@ -65,9 +67,10 @@ def pointpillars(
     score_threshold: float | None = None,
     device: str = "cpu",
     preset: str | None = None,
+    candidates: int | None = None,
 ) -> LidarDetector:
     """PointPillars; see `load`."""
-    return load(path, class_names, nms, score_threshold, device, preset, "pointpillars")
+    return load(path, class_names, nms, score_threshold, device, preset, candidates, "pointpillars")
 
 
 def second(
@@ -77,9 +80,10 @@ def second(
     score_threshold: float | None = None,
     device: str = "cpu",
     preset: str | None = None,
+    candidates: int | None = None,
 ) -> LidarDetector:
     """SECOND; see `load`."""
-    return load(path, class_names, nms, score_threshold, device, preset, "second")
+    return load(path, class_names, nms, score_threshold, device, preset, candidates, "second")
 
 
 def ssn(
@@ -89,9 +93,10 @@ def ssn(
     score_threshold: float | None = None,
     device: str = "cpu",
     preset: str | None = None,
+    candidates: int | None = None,
 ) -> LidarDetector:
     """SSN; see `load`."""
-    return load(path, class_names, nms, score_threshold, device, preset, "ssn")
+    return load(path, class_names, nms, score_threshold, device, preset, candidates, "ssn")
 
 
 def centerpoint(
@@ -101,9 +106,10 @@ def centerpoint(
     score_threshold: float | None = None,
     device: str = "cpu",
     preset: str | None = None,
+    candidates: int | None = None,
 ) -> LidarDetector:
     """CenterPoint; see `load`."""
-    return load(path, class_names, nms, score_threshold, device, preset, "centerpoint")
+    return load(path, class_names, nms, score_threshold, device, preset, candidates, "centerpoint")
 
 
 def part_a2(
@@ -113,9 +119,10 @@ def part_a2(
     score_threshold: float | None = None,
     device: str = "cpu",
     preset: str | None = None,
+    candidates: int | None = None,
 ) -> LidarDetector:
     """Part-A2; see `load`."""
-    return load(path, class_names, nms, score_threshold, device, preset, "part-a2")
+    return load(path, class_names, nms, score_threshold, device, preset, candidates, "part-a2")
 
 
 def pv_rcnn(
@@ -125,9 +132,10 @@ def pv_rcnn(
     score_threshold: float | None = None,
     device: str = "cpu",
     preset: str | None = None,
+    candidates: int | None = None,
 ) -> LidarDetector:
     """PV-RCNN; see `load`."""
-    return load(path, class_names, nms, score_threshold, device, preset, "pv-rcnn")
+    return load(path, class_names, nms, score_threshold, device, preset, candidates, "pv-rcnn")
 
 
 def onnx_lidar(
@@ -136,9 +144,10 @@ def onnx_lidar(
     nms: NmsMode = "off",
     score_threshold: float | None = None,
     threads: int = 0,
+    candidates: int | None = None,
 ) -> LidarDetector:
     """An exported network; see `lcf3d.detectors.lidar.onnx.OnnxLidarDetector`."""
     from lcf3d.detectors.lidar.onnx import OnnxLidarDetector
 
-    detector = OnnxLidarDetector(path, nms=nms, score_threshold=score_threshold, threads=threads)
+    detector = OnnxLidarDetector(path, nms=nms, score_threshold=score_threshold, threads=threads, candidates=candidates)
     return detector if class_names is None else InClasses(detector, tuple(class_names))

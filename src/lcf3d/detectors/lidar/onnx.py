@@ -26,14 +26,20 @@ class OnnxLidarDetector:
         nms: ``off`` (the paper's choice), ``low`` or ``keep``.
         score_threshold: boxes need a higher score; the network's own without one.
         threads: threads of onnxruntime; 0 for one a core.
+        candidates: best boxes considered before suppression; the configuration's own number without it.
 
     Raises:
         DetectorError: the file is not such a network.
-        ConfigError: ``nms`` or ``score_threshold`` makes no sense.
+        ConfigError: ``nms``, ``score_threshold`` or ``candidates`` makes no sense.
     """
 
     def __init__(
-        self, path: Path | str, nms: NmsMode = "keep", score_threshold: float | None = None, threads: int = 0
+        self,
+        path: Path | str,
+        nms: NmsMode = "keep",
+        score_threshold: float | None = None,
+        threads: int = 0,
+        candidates: int | None = None,
     ) -> None:
         suppression_threshold(nms, 0.0)
         if score_threshold is not None and not 0 <= score_threshold < 1:
@@ -42,7 +48,8 @@ class OnnxLidarDetector:
         metadata = self._session.get_modelmeta().custom_metadata_map
         if CONFIG_KEY not in metadata:
             raise DetectorError(f"{path} was not exported by lcf3d: it holds no {CONFIG_KEY}")
-        self.config = LidarConfig.from_dict(json.loads(metadata[CONFIG_KEY]))
+        config = LidarConfig.from_dict(json.loads(metadata[CONFIG_KEY]))
+        self.config = config if candidates is None else config.with_candidates(candidates)
         self.nms = nms
         self.score_threshold = self.config.suppression.score_threshold if score_threshold is None else score_threshold
 
