@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 
 from lcf3d import FusionConfig
-from lcf3d.fusion.self_calibration import self_calibrate
+from lcf3d.fusion.evidence import Evidence
+from lcf3d.fusion.self_calibration import camera_share, self_calibrate
 from lcf3d.structures import KITTI_CLASSES, Detections2D
 from tests.fusion.scenes import CAR, CYCLIST, camera, car, frame, lidar, pedestrian, seen
 
@@ -71,3 +72,28 @@ def test_logits_of_one_lone_box():
     calibration = self_calibrate([(frame([camera()]), found, Detections2D.empty(KITTI_CLASSES))], CONFIG)
     assert calibration.lidar["Car"].transform == "identity"
     assert calibration.lidar["Car"].slope == pytest.approx(1.0)
+
+
+def test_a_camera_that_misses_the_best_boxes_is_believed_less():
+    scores = np.arange(10000.0)
+    rng = np.random.default_rng(0)
+    # of the best 200 boxes 40 % are confirmed: log(0.6) / log(0.1), a little more for the prior
+    assert camera_share(scores, rng.random(10000) < 0.4) == pytest.approx(0.24, abs=0.05)
+    assert camera_share(scores, scores > 5000) == 1
+    assert camera_share(scores[:3], np.zeros(3, dtype=bool)) == 1  # one box proves nothing
+    assert camera_share(scores[:0], np.zeros(0, dtype=bool)) == 1
+
+
+def test_what_is_believed_less_is_the_camera_alone():
+    half = Evidence(support=(1, 2, 3, 4), miss=0.5, trust=0.7).with_camera_share(0.5)
+    assert half == Evidence(support=(0.5, 1, 1.5, 2), miss=0.25, trust=0.7)
+
+
+def test_a_blind_camera_loses_its_weight():
+    blind = [
+        (f, found, Detections2D.empty(KITTI_CLASSES) if i % 2 else two_d)
+        for i, (f, found, two_d) in enumerate(drive(600))
+    ]
+    cars = self_calibrate(blind, CONFIG).evidence["Car"]
+    assert cars.support[-1] < 0.8 * CONFIG.evidence["Car"].support[-1]
+    assert cars.trust == CONFIG.evidence["Car"].trust

@@ -83,6 +83,11 @@ class Evidence(BaseModel):
             recovered=recovered,
         )
 
+    def with_camera_share(self, share: float) -> Evidence:
+        """The same with only a share of what the camera's finding and missing of a box weighs."""
+        support = tuple(value * share for value in self.support)
+        return self.model_copy(update={"support": support, "miss": self.miss * share})
+
     @property
     def weights(self) -> FloatArray:
         """(9,) weights of the columns of `evidence_table`; all but the last, the constant, must not be negative."""

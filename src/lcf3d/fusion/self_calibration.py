@@ -21,6 +21,7 @@ from lcf3d.fusion.calibration import (
 )
 from lcf3d.fusion.calibration_fit import fit_platt
 from lcf3d.fusion.config import FusionConfig
+from lcf3d.fusion.evidence import Evidence
 from lcf3d.fusion.matching import assign
 from lcf3d.geometry.camera import project_boxes
 from lcf3d.geometry.iou import image_iou
@@ -30,6 +31,12 @@ from lcf3d.structures import BoolArray, Detections2D, Detections3D, FloatArray, 
 TEACHER_SCORE = 0.5
 # weight of the prior line, in detections
 PRIOR_STRENGTH = 20.0
+# a camera that confirms this share of the best LiDAR boxes is believed as the settings say, a worse one less
+FULL_RECALL = 0.9
+# share of the boxes of a class that count as the best; even where the LiDAR detector is poor most of them are right
+BEST_SHARE = 0.02
+# before any box is seen the camera is taken to confirm 0.95 of this many
+RECALL_PRIOR = 10.0
 
 FrameDetections = tuple[Frame, Detections3D, Detections2D]
 
@@ -52,12 +59,16 @@ def self_calibrate(frames: Iterable[FrameDetections], config: FusionConfig) -> C
     line by class, pulled towards a logistic of robustly standardised scores, which is what remains when there are few
     boxes or when the camera does not detect the class. Scores of a class that lie in [0, 1] are left as they are.
 
+    A camera that leaves many of the best LiDAR boxes unconfirmed misses much: its weight is then lowered by the ratio
+    of the log-odds that a miss is worth, ``log(1 - recall)``, to the same at ``FULL_RECALL``.
+
     Args:
         frames: each frame with its LiDAR detections and those of its first camera.
         config: settings.
 
     Returns:
-        A `Calibration` without evidence weights; the same for the same frames, whatever their order.
+        A `Calibration`, with evidence weights only where the camera is believed less than the settings say; the same
+        for the same frames, whatever their order.
     """
     parts, camera_labels = [], np.zeros(len(config.class_names), dtype=bool)
     for frame, lidar, camera in frames:
@@ -68,17 +79,22 @@ def self_calibrate(frames: Iterable[FrameDetections], config: FusionConfig) -> C
         return Calibration(source=_SOURCE)
     seen = _Observed(*(np.concatenate(column) for column in zip(*parts, strict=True)))
     maps: dict[str, ScoreMap] = {}
+    evidence: dict[str, Evidence] = {}
     probability = seen.scores.copy()
     for label, name in enumerate(config.class_names):
         own = seen.labels == label
+        taught = seen.visible[own] & camera_labels[label]
+        share = camera_share(seen.scores[own][taught], seen.confirmed[own][taught])
+        if share < 1:
+            evidence[name] = config.evidence.get(name, Evidence()).with_camera_share(share)
         if not own.any() or natural_transform(seen.scores[own]) == "logit":
             continue
-        taught = seen.visible[own] & camera_labels[label]
         maps[name] = _taught_map(seen.scores[own], seen.confirmed[own], taught)
         probability[own] = maps[name](seen.scores[own])
     return Calibration(
         source=_SOURCE,
         lidar=maps,
+        evidence=evidence,
         camera_classes=tuple(name for name, there in zip(config.class_names, camera_labels, strict=True) if there),
         ground_z=ground_height(seen.bottoms[probability > TEACHER_SCORE]),
     )
@@ -98,6 +114,18 @@ def _observe(frame: Frame, lidar: Detections3D, camera: Detections2D, config: Fu
         confirmed = assign(overlap, config.match_iou) >= 0
     bottoms = lidar.boxes[:, 2] - lidar.boxes[:, 5] / 2
     return _Observed(lidar.labels, lidar.scores, bottoms, visible, confirmed)
+
+
+def camera_share(scores: FloatArray, confirmed: BoolArray) -> float:
+    """How much of its weight the camera deserves, 0 to 1, judged by the LiDAR boxes of highest score.
+
+    Args:
+        scores: (N,) of LiDAR boxes of one class that the camera looks at.
+        confirmed: (N,) which of them it confirms.
+    """
+    best = np.lexsort((confirmed, -scores))[: int(np.ceil(BEST_SHARE * len(scores)))]
+    recall = (confirmed[best].sum() + 0.95 * RECALL_PRIOR) / (len(best) + RECALL_PRIOR)
+    return float(np.round(min(np.log1p(-recall) / np.log1p(-FULL_RECALL), 1.0), 4))
 
 
 def _taught_map(scores: FloatArray, confirmed: BoolArray, taught: BoolArray) -> ScoreMap:
