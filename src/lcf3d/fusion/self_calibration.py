@@ -36,7 +36,7 @@ FULL_RECALL = 0.9
 # share of the boxes of a class that count as the best; even where the LiDAR detector is poor most of them are right
 BEST_SHARE = 0.02
 # before any box is seen the camera is taken to confirm 0.95 of this many
-RECALL_PRIOR = 10.0
+RECALL_PRIOR = 20.0
 
 FrameDetections = tuple[Frame, Detections3D, Detections2D]
 
