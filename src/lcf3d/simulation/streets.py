@@ -52,12 +52,12 @@ class StreetType:
 
 
 STREETS: Final[tuple[StreetType, ...]] = (
-    StreetType("residential", 0.34, 4.6, 0.32, 1, 0, False, 1.8, 0.0, 4.0, "houses", 5.0, 8.0, 0.65, 0.8, 0.45, 0.7),
-    StreetType("city", 0.20, 5.4, 0.36, 1, 1, False, 3.2, 0.0, 0.3, "blocks", 4.0, 9.0, 1.1, 3.2, 0.9, 0.8),
-    StreetType("avenue", 0.16, 7.0, None, 2, 2, True, 2.2, 3.0, 5.0, "few", 7.0, 13.0, 1.9, 0.5, 0.3, 0.6),
+    StreetType("residential", 0.34, 4.6, 0.32, 1, 0, False, 1.8, 0.0, 4.0, "houses", 5.0, 8.0, 0.65, 0.5, 0.45, 0.7),
+    StreetType("city", 0.20, 5.4, 0.36, 1, 1, False, 3.2, 0.0, 0.3, "blocks", 4.0, 9.0, 1.1, 1.9, 0.9, 0.8),
+    StreetType("avenue", 0.16, 7.0, None, 2, 2, True, 2.2, 3.0, 5.0, "few", 7.0, 13.0, 1.9, 0.3, 0.3, 0.6),
     StreetType("country", 0.24, 3.6, None, 1, 1, True, 0.0, 2.5, 1.0, "woods", 0.0, 19.0, 0.7, 0.02, 0.06, 0.15),
     StreetType(
-        "square", 0.06, 4.0, None, 1, 0, False, 5.0, 0.0, 0.3, "blocks", 5.0, 3.0, 0.3, 9.0, 2.2, 0.4, "cobbles"
+        "square", 0.06, 4.0, None, 1, 0, False, 5.0, 0.0, 0.3, "blocks", 5.0, 3.0, 0.3, 5.5, 2.2, 0.4, "cobbles"
     ),
 )
 """The streets of the KITTI-like and nuScenes-like presets, with the mix that reproduces KITTI's label counts."""

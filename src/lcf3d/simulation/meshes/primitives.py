@@ -159,13 +159,22 @@ def panel(a: ArrayLike, b: ArrayLike, c: ArrayLike, d: ArrayLike, material: str,
     return make_mesh(quad(a, b, c, d), material, colour, uv)
 
 
+_CUBE_CORNERS = np.array(
+    [[x, y, z] for z in (-0.5, 0.5) for x, y in ((-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5))]
+)
+_CUBE_FACES = ((3, 2, 1, 0), (4, 5, 6, 7), (0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7))
+_CUBE = np.concatenate([quad(*(_CUBE_CORNERS[i] for i in face)) for face in _CUBE_FACES])
+_CUBE_NORMALS = np.repeat(face_normals(_CUBE)[:, None], 3, axis=1).astype(np.float32)
+_CUBE_UV_AXES = np.array([[0, 1]] * 4 + [[0, 2]] * 2 + [[1, 2]] * 2 + [[0, 2]] * 2 + [[1, 2]] * 2)[:, None].repeat(
+    3, axis=1
+)
+
+
 def box(centre: ArrayLike, size: ArrayLike, material: str, colour: ArrayLike, yaw: float = 0.0) -> Mesh:
     """A cuboid with its faces along the axes, turned by ``yaw`` about its own vertical axis."""
-    lx, ly, lz = np.asarray(size, dtype=np.float64) / 2
-    p = np.array([[x, y, z] for z in (-lz, lz) for x, y in ((-lx, -ly), (lx, -ly), (lx, ly), (-lx, ly))])
-    faces = [(3, 2, 1, 0), (4, 5, 6, 7), (0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7)]
-    soup = np.concatenate([quad(*(p[i] for i in f)) for f in faces])
-    mesh = make_mesh(soup, material, colour)
+    corners = _CUBE * np.asarray(size, dtype=np.float64)
+    uv = np.take_along_axis(corners, _CUBE_UV_AXES, axis=2)
+    mesh = make_mesh(corners, material, colour, uv, _CUBE_NORMALS)
     return (mesh.turned(rotation_z(yaw)) if yaw else mesh).moved(centre)
 
 
