@@ -41,12 +41,14 @@ class FrameSummary:
         frame_id: the frame.
         outputs: fused detections by stage and class, for example ``("recovered", "Pedestrian")``.
         dropped: LiDAR detections dropped, by reason.
+        notes: what was missing or left out.
         milliseconds: by part: ``lidar``, ``camera``, ``fusion``, ``write``.
     """
 
     frame_id: str
     outputs: Counter[tuple[str, str]] = field(default_factory=Counter)
     dropped: Counter[str] = field(default_factory=Counter)
+    notes: tuple[str, ...] = ()
     milliseconds: dict[str, float] = field(default_factory=dict)
 
 
@@ -82,7 +84,10 @@ class FrameRunner:
         marks.append(perf_counter())
         parts = ("lidar", "camera", "fusion", "write")
         spent = {name: (b - a) * 1e3 for name, a, b in zip(parts, marks[:-1], marks[1:], strict=True)}
-        return summarize(frame_id, fused, spent)
+        # a camera that this run was never to use is nothing to report
+        unused = tuple(f"camera {camera.name} " for camera in frame.cameras if camera.name not in self.cameras)
+        notes = tuple(note for note in fused.notes if not note.startswith(unused))
+        return replace(summarize(frame_id, fused, spent), notes=notes)
 
     def _with_absent_cameras(self, fused: FusedDetections, frame: Frame) -> FusedDetections:
         """The same with a note on each camera that the run uses and the dataset left out of this frame."""
@@ -123,7 +128,7 @@ def summarize(frame_id: str, fused: FusedDetections, milliseconds: dict[str, flo
         for stage, label in zip(fused.stages, fused.detections.labels, strict=True)
     )
     dropped = Counter(Reason(reason).name.lower() for reason in fused.lidar.reason[fused.dropped_lidar])
-    return FrameSummary(frame_id, outputs, dropped, milliseconds)
+    return FrameSummary(frame_id, outputs, dropped, milliseconds=milliseconds)
 
 
 _worker: FrameRunner
@@ -161,12 +166,14 @@ def run_frames(runner: FrameRunner, frame_ids: Sequence[str], jobs: int = 1) -> 
 
 
 def total(summaries: Sequence[FrameSummary]) -> dict[str, Any]:
-    """Counts over all frames and the median milliseconds of each part, as plain JSON values."""
+    """Counts over all frames, frames by note, and the median milliseconds of each part, as plain JSON values."""
     outputs: Counter[tuple[str, str]] = Counter()
     dropped: Counter[str] = Counter()
+    notes: Counter[str] = Counter()
     for summary in summaries:
         outputs += summary.outputs
         dropped += summary.dropped
+        notes.update(set(summary.notes))
     by_stage: dict[str, dict[str, int]] = {}
     for (stage, name), count in sorted(outputs.items()):
         by_stage.setdefault(stage, {})[name] = count
@@ -176,5 +183,6 @@ def total(summaries: Sequence[FrameSummary]) -> dict[str, Any]:
         "frames": len(summaries),
         "outputs": by_stage,
         "dropped_lidar": dict(sorted(dropped.items())),
+        "notes": dict(notes.most_common()),
         "median_ms": {part: round(value, 3) for part, value in medians.items()},
     }

@@ -109,6 +109,7 @@ class World:
         result = CliRunner().invoke(app, self.arguments(*more))
         if result.exception is not None:
             raise result.exception
+        self.printed = result.stdout
         return RunFolder(self.out)
 
 
@@ -169,6 +170,8 @@ def test_a_camera_that_is_late_or_missing_is_left_out_and_says_so(world: World, 
 
     world.change("sample_data", edit)
     folder = world.run()
+    assert world.printed.count("nobody looked there") == 1
+    assert "in 1 frames: camera CAM_BACK is missing" in world.printed
     fused, other = folder.read(world.tokens["a"]), folder.read(world.tokens["b"])
     assert "CAM_BACK" not in fused.camera_names
     assert len(fused.camera_names) == 5

@@ -140,6 +140,8 @@ def _print(counts: dict[str, Any]) -> None:
     console.print(table)
     for reason, count in counts["dropped_lidar"].items():
         console.print(f"dropped LiDAR detections, {reason.replace('_', ' ')}: {count}")
+    for note, count in counts["notes"].items():
+        console.print(f"in {count} frames: {note}", soft_wrap=True)
     if counts["median_ms"]:
         console.print("median ms a frame: " + ", ".join(f"{k} {v:.1f}" for k, v in counts["median_ms"].items()))
     console.print(f"results in {counts['out']}", soft_wrap=True)
