@@ -90,7 +90,7 @@ def _table(rows: Sequence[AblationRow], frames: int) -> Table:
     for name in names:
         table.add_column(name, justify="right", no_wrap=True)
     for stage in ("matched", "recovered", "kept"):
-        table.add_column(stage, justify="right")
+        table.add_column(stage, justify="right", no_wrap=True)
     group = ""
     for row in rows:
         if row.group != group:

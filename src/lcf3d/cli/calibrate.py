@@ -131,7 +131,7 @@ def wide_console() -> Any:
     from rich.console import Console
 
     console = Console()
-    return console if console.is_terminal else Console(width=120)
+    return console if console.is_terminal else Console(width=130)
 
 
 def _print_calibration(console: Any, study: CalibrationStudy, calibration: Calibration) -> None:
