@@ -156,15 +156,14 @@ class AdaptedLidar:
 def in_kitti_classes(detections: Detections3D) -> Detections3D:
     """Detections of either dataset's classes in KITTI's three: bicycles and motorcycles count as Cyclist.
 
-    Cycles that the detector says are without a rider, and all other classes, are left out.
+    Attributes are not looked at: by convention detectors call every cycle ``without_rider`` that they know nothing
+    about. What stands for a cycle without a rider is found out by `without_ignored`.
     """
-    if detections.attributes is not None:
-        detections = detections[detections.attributes != "cycle.without_rider"]
     return detections.with_classes(KITTI_CLASSES, _COUNTED_AS)
 
 
 def camera_in_kitti_classes(detections: Detections2D) -> Detections2D:
-    """The same for 2D detections, which have no attributes."""
+    """The same for 2D detections."""
     return detections.with_classes(KITTI_CLASSES, _COUNTED_AS)
 
 
