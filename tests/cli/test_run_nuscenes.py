@@ -159,6 +159,17 @@ def test_at_most_500_boxes_a_sample_the_best_ones(world: World) -> None:
     assert scores[-1] == pytest.approx(fused.detections.scores[499], abs=1e-6)
 
 
+def test_two_processes_and_a_resumed_run_write_the_same(world: World) -> None:
+    world.run()
+    whole = (world.out / "results.json").read_bytes()
+    (world.out / "results.json").unlink()
+    RunFolder(world.out).provenance_path(world.tokens["b"]).unlink()
+    world.run("--resume")
+    assert (world.out / "results.json").read_bytes() == whole
+    world.run("--jobs", "2", "--overwrite")
+    assert (world.out / "results.json").read_bytes() == whole
+
+
 @pytest.mark.parametrize("how", ["late", "missing"])
 def test_a_camera_that_is_late_or_missing_is_left_out_and_says_so(world: World, how: str) -> None:
     def edit(records: list[dict]) -> None:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 def generalize(
     task: Annotated[
         list[str],
-        typer.Option(help="TRAINED->TESTED DATASET lidar=SPEC [camera=SPEC] [split=NAME] ...; repeatable"),
+        typer.Option(help="TRAINED->TESTED DATASET lidar=SPEC, then camera=SPEC, split=NAME ...; repeatable"),
     ],
     out: Annotated[Path, typer.Option(help="folder for the report, the charts and the numbers")],
     config: Annotated[str, typer.Option(help="preset or YAML file, in KITTI's classes")] = "kitti",
