@@ -171,9 +171,7 @@ class Detections3D:
                 [np.full((len(p), 2), np.nan) if p.velocities is None else p.velocities for p in parts]
             )
         if any(p.attributes is not None for p in parts):
-            attributes = np.concatenate(
-                [np.full(len(p), "") if p.attributes is None else p.attributes for p in parts]
-            )
+            attributes = np.concatenate([np.full(len(p), "") if p.attributes is None else p.attributes for p in parts])
         return cls(
             np.concatenate([p.boxes for p in parts]),
             np.concatenate([p.scores for p in parts]),

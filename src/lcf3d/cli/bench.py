@@ -83,9 +83,11 @@ def _simulation() -> list[dict[str, Any]]:
 
 
 def _detectors(names: list[str] | None) -> list[dict[str, Any]]:
+    from lcf3d.detectors.camera.torchvision_benchmarking import benchmark_camera
     from lcf3d.detectors.lidar.benchmarking import benchmark
 
-    return [cost.to_dict() for cost in benchmark(names)]
+    camera = [] if names else benchmark_camera()
+    return [cost.to_dict() for cost in (*benchmark(names), *camera)]
 
 
 def _row(timing: Timing) -> dict[str, Any]:

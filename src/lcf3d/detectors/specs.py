@@ -36,9 +36,18 @@ KINDS: dict[Sensor, dict[str, str]] = {
     "camera": {
         "onnx": "lcf3d.detectors.camera.onnx:OnnxDetector",
         "results": "lcf3d.detectors.results:CameraResults",
+        "fasterrcnn": "lcf3d.detectors.camera.torchvision_fasterrcnn:TorchvisionFasterRCNN",
+        "mmdet": "lcf3d.detectors.camera.mmdet:MmdetDetector",
     },
     "lidar": {
         "results": "lcf3d.detectors.results:LidarResults",
+        "onnx-lidar": "lcf3d.detectors.lidar.kinds:onnx_lidar",
+        "pointpillars": "lcf3d.detectors.lidar.kinds:pointpillars",
+        "second": "lcf3d.detectors.lidar.kinds:second",
+        "ssn": "lcf3d.detectors.lidar.kinds:ssn",
+        "centerpoint": "lcf3d.detectors.lidar.kinds:centerpoint",
+        "part-a2": "lcf3d.detectors.lidar.kinds:part_a2",
+        "pv-rcnn": "lcf3d.detectors.lidar.kinds:pv_rcnn",
     },
 }
 
