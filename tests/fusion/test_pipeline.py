@@ -65,6 +65,15 @@ def test_the_camera_decides_the_label():
     assert fused.detections.scores.tolist() == [0.7]
 
 
+@pytest.mark.parametrize(("relabel_score", "label", "score"), [(0.69, CAR, 0.7), (0.7, CYCLIST, 0.8)])
+def test_a_camera_that_is_not_sure_changes_no_label(relabel_score, label, score):
+    found2d = seen(camera(), [NEAR], [0.7], [CAR])
+    fused = fuse(lidar([NEAR], [0.8], [CYCLIST]), {"left": found2d}, relabel_score=relabel_score)
+    assert fused.detections.labels.tolist() == [label]
+    assert fused.detections.scores.tolist() == [score]
+    assert fused.stages.tolist() == [Stage.MATCHED]
+
+
 @pytest.mark.parametrize(("policy", "score"), [("drop", None), ("keep", 0.6), ("downweight", 0.6 * 0.2 / 0.44)])
 def test_policies_for_unmatched_clusters(policy, score):
     fused = fuse(lidar([FAR], [0.6]), {"left": none2d()}, unmatched=policy)

@@ -30,6 +30,8 @@ Dataset = KittiDataset | NuscenesDataset
 
 # frames that a calibration without labels looks at, evenly over the run
 TEACHING_FRAMES = 400
+# the same where a camera detector has to be run on them
+TEACHING_IMAGES = 40
 # with fewer frames than this, a class that the camera branch did not detect may just not have been there
 FEW_FRAMES = 100
 
@@ -180,7 +182,7 @@ def _fusion(config: FusionConfig, calibration: Calibration | None) -> LateCascad
 def _calibration(
     request: RunRequest, runner: FrameRunner, frame_ids: Sequence[str], config: FusionConfig, resumed: RunFolder | None
 ) -> Calibration | None:
-    """The calibration of the file asked for, or, where LiDAR scores leave [0, 1], one taught by the camera.
+    """The calibration of the file asked for, or one taught by the camera, where that is needed or costs nothing.
 
     Raises:
         ConfigError: scores outside [0, 1] that nothing calibrates.
@@ -192,14 +194,18 @@ def _calibration(
     if isinstance(runner.lidar, LidarOnScans):
         return None
     low, high = _score_range(runner, frame_ids)
-    if low >= 0 and high <= 1:
+    probabilities = low >= 0 and high <= 1
+    in_files = all(not isinstance(source, CameraOnImages) for source in runner.cameras.values())
+    # probabilities need no map, but evidence also asks which classes the camera knows, which files tell at no cost
+    if probabilities and not (config.ensemble == "evidence" and in_files and len(frame_ids) >= FEW_FRAMES):
         return None
-    chosen = frame_ids[:: max(1, len(frame_ids) // TEACHING_FRAMES)]
-    typer.echo(
-        f"LiDAR scores go from {low:.4g} to {high:.4g} and are no probabilities: calibrated without labels on "
-        f"{len(chosen)} frames, with the camera as teacher; 'lcf3d calibrate' on labelled frames does better",
-        err=True,
-    )
+    chosen = frame_ids[:: -(-len(frame_ids) // (TEACHING_FRAMES if in_files else TEACHING_IMAGES))]
+    if not probabilities:
+        typer.echo(
+            f"LiDAR scores go from {low:.4g} to {high:.4g} and are no probabilities: calibrated without labels on "
+            f"{len(chosen)} frames, with the camera as teacher; 'lcf3d calibrate' on labelled frames does better",
+            err=True,
+        )
     teaching = []
     for frame_id in chosen:
         frame = runner.dataset.frame(frame_id)

@@ -71,6 +71,9 @@ class FusionConfig(BaseModel):
     evidence: dict[str, Evidence] = Field(
         default_factory=dict, description="ensemble evidence: weights by class, where no calibration gives them"
     )
+    relabel_score: Fraction = Field(
+        default=0.0, description="where labels differ, a 2D detection above it gives label and score (Algorithm 1: all)"
+    )
     priors: dict[str, Annotated[float, Field(gt=0, lt=1)]] = Field(
         default_factory=dict, description="prior by class; classes left out are uniform"
     )
@@ -189,13 +192,20 @@ PRESETS: dict[str, dict[str, Any]] = {
             "Cyclist": {**_PERSON, "rival": 0.0},
         },
     },
+    # measured with simulated camera detections only: docs/six-cameras.md
     "nuscenes": {
         "class_names": NUSCENES_CLASSES,
-        "camera_score_threshold": 0.2,
+        "camera_score_threshold": 0.1,
+        "decisive_score": 0.2,
         "lidar_score_threshold": 0.05,
-        "match_iou": 0.5,
+        "class_aware": True,
+        "assignment": "class_first",
+        "match_iou": 0.4,
         "enlargement": 0.0,
         "unmatched": "downweight",
         "out_of_view": "keep",
+        "ensemble": "evidence",
+        "evidence": {name: {**_PERSON, "rival": 0.0} for name in NUSCENES_CLASSES},
+        "relabel_score": 0.8,
     },
 }

@@ -77,8 +77,11 @@ def decide_clusters(
     agreed = labels[matched] == camera_labels
     if config.ensemble != "none":
         ensemble: Ensemble = "product" if config.ensemble == "product" else "probabilistic"
-        scores[matched], labels[matched] = semantic_fusion(
-            scores[matched], labels[matched], camera_scores, camera_labels, config.prior_array(), ensemble
+        # a camera detection that is not sure enough of another class confirms the box and leaves it as it is
+        sure = agreed | (camera_scores > config.relabel_score)
+        fused = matched[sure]
+        scores[fused], labels[fused] = semantic_fusion(
+            scores[fused], labels[fused], camera_scores[sure], camera_labels[sure], config.prior_array(), ensemble
         )
     if weighed is not None:
         scores[matched[agreed]] = weighed[matched[agreed]]
