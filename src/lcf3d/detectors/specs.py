@@ -21,6 +21,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from importlib import import_module
 from importlib.metadata import entry_points
 from typing import Any, Literal
@@ -142,7 +143,9 @@ def _settings(build: Any) -> set[str] | None:
     parameters = list(inspect.signature(build).parameters.values())[1:]
     if any(p.kind is p.VAR_KEYWORD for p in parameters):
         return None
-    return {p.name for p in parameters if p.kind is not p.VAR_POSITIONAL} - {"class_names"}
+    # what a partial has bound is part of the kind, not a setting
+    bound = build.keywords if isinstance(build, partial) else {}
+    return {p.name for p in parameters if p.kind is not p.VAR_POSITIONAL} - {"class_names", *bound}
 
 
 def _value(text: str) -> Setting:

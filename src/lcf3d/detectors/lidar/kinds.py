@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -60,82 +61,13 @@ def load(
     return detector if class_names is None else InClasses(detector, tuple(class_names))
 
 
-def pointpillars(
-    path: str,
-    class_names: Sequence[str] | None = None,
-    nms: NmsMode = "off",
-    score_threshold: float | None = None,
-    device: str = "cpu",
-    preset: str | None = None,
-    candidates: int | None = None,
-) -> LidarDetector:
-    """PointPillars; see `load`."""
-    return load(path, class_names, nms, score_threshold, device, preset, candidates, "pointpillars")
-
-
-def second(
-    path: str,
-    class_names: Sequence[str] | None = None,
-    nms: NmsMode = "off",
-    score_threshold: float | None = None,
-    device: str = "cpu",
-    preset: str | None = None,
-    candidates: int | None = None,
-) -> LidarDetector:
-    """SECOND; see `load`."""
-    return load(path, class_names, nms, score_threshold, device, preset, candidates, "second")
-
-
-def ssn(
-    path: str,
-    class_names: Sequence[str] | None = None,
-    nms: NmsMode = "off",
-    score_threshold: float | None = None,
-    device: str = "cpu",
-    preset: str | None = None,
-    candidates: int | None = None,
-) -> LidarDetector:
-    """SSN; see `load`."""
-    return load(path, class_names, nms, score_threshold, device, preset, candidates, "ssn")
-
-
-def centerpoint(
-    path: str,
-    class_names: Sequence[str] | None = None,
-    nms: NmsMode = "off",
-    score_threshold: float | None = None,
-    device: str = "cpu",
-    preset: str | None = None,
-    candidates: int | None = None,
-) -> LidarDetector:
-    """CenterPoint; see `load`."""
-    return load(path, class_names, nms, score_threshold, device, preset, candidates, "centerpoint")
-
-
-def part_a2(
-    path: str,
-    class_names: Sequence[str] | None = None,
-    nms: NmsMode = "off",
-    score_threshold: float | None = None,
-    device: str = "cpu",
-    preset: str | None = None,
-    candidates: int | None = None,
-) -> LidarDetector:
-    """Part-A2; see `load`."""
-    return load(path, class_names, nms, score_threshold, device, preset, candidates, "part-a2")
-
-
-def pv_rcnn(
-    path: str,
-    class_names: Sequence[str] | None = None,
-    nms: NmsMode = "off",
-    score_threshold: float | None = None,
-    device: str = "cpu",
-    preset: str | None = None,
-    candidates: int | None = None,
-) -> LidarDetector:
-    """PV-RCNN; see `load`."""
-    return load(path, class_names, nms, score_threshold, device, preset, candidates, "pv-rcnn")
+# one name a kind: a checkpoint of another network is refused
+pointpillars = partial(load, architecture="pointpillars")
+second = partial(load, architecture="second")
+ssn = partial(load, architecture="ssn")
+centerpoint = partial(load, architecture="centerpoint")
+part_a2 = partial(load, architecture="part-a2")
+pv_rcnn = partial(load, architecture="pv-rcnn")
 
 
 def onnx_lidar(
