@@ -112,22 +112,20 @@ def points_in_image_boxes(points, projection, near, boxes):  # type: ignore[no-u
     """
     candidates, pixels = _project_into(points, projection, near, boxes)
     offsets = np.zeros(len(boxes) + 1, np.int64)
+    hits = np.empty(len(candidates) + 1, np.int64)
     for k in range(len(boxes)):
-        inside = 0
-        for n in range(len(candidates)):
+        x1, y1, x2, y2 = boxes[k, 0], boxes[k, 1], boxes[k, 2], boxes[k, 3]
+        first = offsets[k]
+        if len(hits) < first + len(candidates) + 1:
+            hits = np.concatenate((hits, np.empty(len(hits) + len(candidates), np.int64)))
+        at = first
+        for n in range(len(candidates)):  # without branches, which would be guessed wrongly half of the time
             u, v = pixels[n, 0], pixels[n, 1]
-            inside += (boxes[k, 0] <= u) & (u <= boxes[k, 2]) & (boxes[k, 1] <= v) & (v <= boxes[k, 3])
-        offsets[k + 1] = offsets[k] + inside
-    index = np.empty(offsets[-1], np.int64)
-    at_pixels = np.empty((offsets[-1], 2))
-    for k in range(len(boxes)):
-        at = offsets[k]
-        for n in range(len(candidates)):
-            u, v = pixels[n, 0], pixels[n, 1]
-            if boxes[k, 0] <= u <= boxes[k, 2] and boxes[k, 1] <= v <= boxes[k, 3]:
-                index[at], at_pixels[at, 0], at_pixels[at, 1] = candidates[n], u, v
-                at += 1
-    return index, at_pixels, offsets
+            hits[at] = n
+            at += (x1 <= u) & (u <= x2) & (y1 <= v) & (v <= y2)
+        offsets[k + 1] = at
+    hits = hits[: offsets[-1]]
+    return candidates[hits], pixels[hits], offsets
 
 
 @njit(cache=True, nogil=True)
@@ -170,10 +168,17 @@ def enlarge_boxes(boxes: FloatArray, enlargement: float) -> FloatArray:
 
 def gaussian_mask(pixels: FloatArray, box: FloatArray) -> NDArray[np.float32]:
     """(N,) G of the paper (section 4.1.4) at (N, 2) pixels: sigma is the width and height of the (4,) 2D box."""
-    centre = (box[:2] + box[2:]) / 2
-    sides = np.maximum(box[2:] - box[:2], 1e-6)
-    exponent = ((pixels - centre) / sides) ** 2
-    mask: NDArray[np.float32] = np.exp(-0.5 * exponent.sum(axis=1)).astype(np.float32)
+    mask: NDArray[np.float32] = _gaussian(pixels, *box.tolist())
+    return mask
+
+
+@njit(cache=True, nogil=True)
+def _gaussian(pixels, x1, y1, x2, y2):  # type: ignore[no-untyped-def]
+    u, v, width, height = (x1 + x2) / 2, (y1 + y2) / 2, max(x2 - x1, 1e-6), max(y2 - y1, 1e-6)
+    mask = np.empty(len(pixels), np.float32)
+    for n in range(len(pixels)):
+        a, b = (pixels[n, 0] - u) / width, (pixels[n, 1] - v) / height
+        mask[n] = np.exp(-0.5 * (a * a + b * b))
     return mask
 
 
@@ -239,7 +244,9 @@ def extract_frustums(
             if mask_mode == "mask" and on_mask.sum() >= min_points:
                 inside, weight, on_mask = inside[on_mask], weight[on_mask], on_mask[on_mask]
             if len(inside) >= min_points:
-                parts.append((_turn(points[inside], -yaws[k]), weight, on_mask.astype(np.float32)))
+                parts.append(
+                    (_turned(points, inside, np.cos(yaws[k]), -np.sin(yaws[k])), weight, on_mask.astype(np.float32))
+                )
                 rows.append((c, int(d), float(yaws[k])))
     return _assemble(points, cameras, detections, parts, rows, second, mask_mode)
 
@@ -252,12 +259,15 @@ def _on_mask(found: Detections2D, detection: int, pixels: FloatArray, mask_mode:
     return instance.contains(pixels)
 
 
-def _turn(points: NDArray[np.float32], angle: float) -> NDArray[np.float32]:
-    """Points turned counter-clockwise about the vertical axis."""
-    turned = points.copy()
-    cos, sin = np.float32(np.cos(angle)), np.float32(np.sin(angle))
-    turned[:, 0] = cos * points[:, 0] - sin * points[:, 1]
-    turned[:, 1] = sin * points[:, 0] + cos * points[:, 1]
+@njit(cache=True, nogil=True)
+def _turned(points, index, cos, sin):  # type: ignore[no-untyped-def]
+    """Chosen points, turned counter-clockwise about the vertical axis by the angle of that cosine and sine."""
+    turned = np.empty((len(index), points.shape[1]), np.float32)
+    for n in range(len(index)):
+        x, y = points[index[n], 0], points[index[n], 1]
+        turned[n, 0], turned[n, 1] = cos * x - sin * y, sin * x + cos * y
+        for c in range(2, points.shape[1]):
+            turned[n, c] = points[index[n], c]
     return turned
 
 

@@ -179,8 +179,9 @@ class LateCascadeFusion:
             candidates = [free[:0] for free in candidates]
             points = np.zeros((0, 4), np.float32)
         else:
-            if not np.isfinite(points[:, :3].sum(dtype=np.float64)):  # one bad value spoils the sum; ten times quicker
-                bad = int((~np.isfinite(points[:, :3]).all(axis=1)).sum())
+            # one bad value spoils the sum, which takes a fifth of the time of a look at every value
+            bad = 0 if np.isfinite(points.sum()) else int((~np.isfinite(points[:, :3]).all(axis=1)).sum())
+            if bad:
                 notes.append(f"{bad} points of the scan are not finite and were not used")
             candidates, pairs = self._choose_candidates(branches, candidates)
         recovery = recover(
