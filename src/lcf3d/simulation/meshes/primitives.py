@@ -69,7 +69,9 @@ class Mesh:
     def turned(self, rotation: ArrayLike) -> Mesh:
         """Rotated by a (3, 3) matrix."""
         r = np.asarray(rotation, dtype=np.float32).T
-        return replace(self, corners=self.corners @ r, normals=self.normals @ r)
+        # as one product of all points: numpy multiplies stacks of small matrices one by one
+        corners, normals = (a.reshape(-1, 3) @ r for a in (self.corners, self.normals))
+        return replace(self, corners=corners.reshape(self.corners.shape), normals=normals.reshape(self.normals.shape))
 
     def placed(self, x: float, y: float, z: float, yaw: float) -> Mesh:
         """Rotated about +z by ``yaw`` and then shifted."""
