@@ -7,11 +7,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from lcf3d.errors import ConfigError
+from lcf3d.errors import ConfigError, DatasetError
 
 if TYPE_CHECKING:
     from rich.table import Table
 
+    from lcf3d.cli.run_setup import RunRequest
     from lcf3d.evaluation.ablation import AblationInput, AblationRow
     from lcf3d.formats.kitti import KittiFrames
     from lcf3d.fusion.calibration import Calibration
@@ -20,14 +21,15 @@ if TYPE_CHECKING:
 
 def ablate(
     dataset: Annotated[str, typer.Argument(help="kitti:ROOT, with labels")],
-    lidar: Annotated[str, typer.Option(help="results of the LiDAR detector, results:DIR")],
-    camera: Annotated[str, typer.Option(help="results of the camera detector, results:DIR")],
+    lidar: Annotated[str, typer.Option(help="LiDAR detector, kind:argument, for example results:DIR")],
+    camera: Annotated[str, typer.Option(help="camera detector, kind:argument, for example results:DIR or onnx:FILE")],
     split: Annotated[str, typer.Option(help="file of ROOT/ImageSets")] = "val",
     calibration: Annotated[
         str, typer.Option(help="score calibration: a file of 'lcf3d calibrate', auto, or none")
     ] = "auto",
     config: Annotated[str, typer.Option(help="preset or YAML file that the variants change")] = "kitti",
     set_: Annotated[list[str] | None, typer.Option("--set", help="change a setting, name=value; repeatable")] = None,
+    tiles: Annotated[int, typer.Option(min=1, help="overlapping tiles across wide images, for onnx: detectors")] = 1,
     missing: Annotated[str, typer.Option(help="result files that are not there: error, or empty")] = "error",
     json_: Annotated[bool, typer.Option("--json", help="print the rows as JSON")] = False,
 ) -> None:
@@ -35,16 +37,22 @@ def ablate(
 
     Rows with detection recovery need LiDAR scans for all frames, mask modes a camera detector with masks.
 
-    Example: lcf3d ablate kitti:KITTI --split val --lidar results:point_gnn --camera results:rcnn
+    Examples:
+
+    lcf3d ablate kitti:KITTI --split val --lidar results:point_gnn --camera results:rcnn
+
+    lcf3d ablate kitti:KITTI --split val --lidar results:point_gnn --camera onnx:segmentation.onnx --tiles 2
     """
     import json
 
     from lcf3d.cli.calibrate import plain, tracked, wide_console
-    from lcf3d.cli.options import build_config
+    from lcf3d.cli.run_setup import RunRequest
     from lcf3d.evaluation.ablation import ablate as measure
 
-    settings = build_config(config, set_ or [])
-    inputs, truth = _read(dataset, split, lidar, camera, settings, missing)
+    request = RunRequest(
+        dataset, lidar, {"left": camera}, split, config=config, changes=tuple(set_ or ()), tiles=tiles, missing=missing
+    )
+    inputs, truth, settings = _read(request)
     scores = _calibration(calibration, inputs, settings)
     rows = measure(inputs, truth, settings, scores, progress=plain if json_ else tracked)
     scans = all(item.frame.points is not None for item in inputs)
@@ -57,16 +65,24 @@ def ablate(
         console.print("not every frame has a LiDAR scan: rows with detection recovery are left out", soft_wrap=True)
 
 
-def _read(
-    dataset: str, split: str, lidar: str, camera: str, settings: FusionConfig, missing: str
-) -> tuple[list[AblationInput], KittiFrames]:
-    """Frames with their detections, and the labels."""
-    from lcf3d.cli.calibrate import open_study
+def _read(request: RunRequest) -> tuple[list[AblationInput], KittiFrames, FusionConfig]:
+    """Frames with their detections, the labels, and the settings."""
+    from lcf3d.cli.run_setup import read_inputs
+    from lcf3d.datasets.kitti import KittiDataset
     from lcf3d.evaluation.ablation import AblationInput
+    from lcf3d.formats.kitti import read_folder
 
-    study = open_study(dataset, split, lidar, camera, settings, folds=0, missing=missing, quiet=True)
-    inputs = zip(study.frames, study.lidar_inputs, study.camera_inputs, strict=True)
-    return [AblationInput(*item) for item in inputs], study.truth
+    found = read_inputs(request)
+    if not isinstance(found.dataset, KittiDataset):
+        raise ConfigError(f"ablate reads kitti:ROOT, got {request.dataset!r}")
+    truth = read_folder(found.dataset.folder / "label_2", found.frame_ids, results=False)
+    inputs = []
+    for frame in map(found.dataset.frame, found.frame_ids):
+        camera = found.cameras["left"]
+        if not camera.sees(frame, "left"):
+            raise DatasetError(f"frame {frame.id} has no left image; pass results:DIR as the camera branch")
+        inputs.append(AblationInput(frame, found.lidar.detect(frame), camera.detect(frame, "left")))
+    return inputs, truth, found.config
 
 
 def _calibration(text: str, inputs: Sequence[AblationInput], settings: FusionConfig) -> Calibration | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import typer
 
@@ -43,15 +43,25 @@ class RunRequest:
     dataset: str
     lidar: str
     cameras: dict[str, str]
-    split: str | None
-    version: str | None
-    frames: tuple[str, ...]
-    config: str | None
-    changes: tuple[str, ...]
-    recovery: str | None
-    tiles: int
-    calibration: str
-    missing: str
+    split: str | None = None
+    version: str | None = None
+    frames: tuple[str, ...] = ()
+    config: str | None = None
+    changes: tuple[str, ...] = ()
+    recovery: str | None = None
+    tiles: int = 1
+    calibration: str = "auto"
+    missing: str = "error"
+
+
+class Inputs(NamedTuple):
+    """What a run reads: dataset, frames, settings, the LiDAR branch and the branch of each camera."""
+
+    dataset: Dataset
+    frame_ids: tuple[str, ...]
+    config: FusionConfig
+    lidar: LidarSource
+    cameras: dict[str, CameraSource]
 
 
 @dataclass(frozen=True)
@@ -71,16 +81,7 @@ def prepare_run(request: RunRequest, out: Path, *, resume: bool, overwrite: bool
     Raises:
         Lcf3dError: anything wrong with the request, the dataset or the result files.
     """
-    kind, root = parse_dataset(request.dataset)
-    config = _config(request, kind)
-    dataset = _dataset(request, kind, root, config)
-    frame_ids = _frame_ids(request, dataset)
-    lidar = _lidar_source(request, dataset, config)
-    cameras = _camera_sources(request, dataset, config)
-    for source in (lidar, *cameras.values()):
-        if isinstance(source, KittiResults):
-            source.load(frame_ids)
-    _require_images(dataset, frame_ids, cameras)
+    dataset, frame_ids, config, lidar, cameras = read_inputs(request)
     folder = KittiRunFolder(out) if isinstance(dataset, KittiDataset) else NuscenesRunFolder(out, dataset)
     runner = FrameRunner(dataset, lidar, cameras, _fusion(config, None), folder)
     from lcf3d import __version__
@@ -96,6 +97,25 @@ def prepare_run(request: RunRequest, out: Path, *, resume: bool, overwrite: bool
         calibration.dump(folder.calibration_path)
         runner.fusion = _fusion(config, calibration)
     return Run(dataset, frame_ids, config, runner, folder)
+
+
+def read_inputs(request: RunRequest) -> Inputs:
+    """The dataset, settings and both branches, result files read and images looked for.
+
+    Raises:
+        Lcf3dError: anything wrong with the request, the dataset or the result files.
+    """
+    kind, root = parse_dataset(request.dataset)
+    config = _config(request, kind)
+    dataset = _dataset(request, kind, root, config)
+    frame_ids = _frame_ids(request, dataset)
+    lidar = _lidar_source(request, dataset, config)
+    cameras = _camera_sources(request, dataset, config)
+    for source in (lidar, *cameras.values()):
+        if isinstance(source, KittiResults):
+            source.load(frame_ids)
+    _require_images(dataset, frame_ids, cameras)
+    return Inputs(dataset, frame_ids, config, lidar, cameras)
 
 
 def _as_json(value: dict[str, Any]) -> dict[str, Any]:
