@@ -1,4 +1,4 @@
-"""``lcf3d demo``: the method on an embedded street, without data, network or torch."""
+"""``lcf3d demo``: the method on a drive that comes with the package, without data, network or torch."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ if TYPE_CHECKING:
 
 def demo(
     out: Annotated[Path, typer.Option(help="folder for the pictures")] = Path("lcf3d-demo"),
-    frames: Annotated[int, typer.Option(min=1, help="frames to drive")] = 20,
-    seed: Annotated[int, typer.Option(help="another street")] = 0,
+    frames: Annotated[int, typer.Option(min=1, max=20, help="frames to drive")] = 20,
+    seed: Annotated[int, typer.Option(min=0, help="of the detectors' noise, misses and false alarms")] = 0,
     json_: Annotated[bool, typer.Option("--json", help="print the figures as JSON")] = False,
 ) -> None:
-    """Drive along a street made of boxes, fuse two cameras with a LiDAR, compare with the LiDAR alone.
+    """Drive along a simulated street, fuse a camera with a LiDAR, compare with the LiDAR alone.
 
-    The detectors are made from the truth with noise, misses and false alarms: the figures show what the fusion does,
-    not how good any detector is.
+    Images, scans and labels come with the package (made by lcf3d simulate). The detectors are made from the labels
+    with noise, misses and false alarms: the figures show what the fusion does, not how good any detector is.
     """
     import json
 

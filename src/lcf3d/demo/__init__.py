@@ -1,1 +1,1 @@
-"""The embedded demonstration: a street of boxes, detectors with known faults, and what the fusion makes of them."""
+"""The demonstration: a simulated drive, detectors with known faults, and what the fusion makes of them."""

@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 
 from lcf3d.demo.detectors import camera_detections, ground_truth, lidar_detections
-from lcf3d.demo.sensors import cameras, photograph, scan
-from lcf3d.demo.street import Drive
+from lcf3d.demo.shipped import read_drive
 from lcf3d.evaluation.generalization import GeneralizationMetrics, evaluate_generalization
 from lcf3d.fusion.clustering import cluster_boxes
 from lcf3d.fusion.config import FusionConfig
@@ -22,7 +21,6 @@ from lcf3d.provenance import FusedDetections
 from lcf3d.structures import Detections2D, Detections3D, Frame
 
 FRAMES = 20
-LEAST_POINTS = 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +28,7 @@ class DemoFrame:
     """One moment of the drive with what the detectors say of it.
 
     Attributes:
-        frame: scan, images, cameras and ground truth: objects in view of a camera, of at least `LEAST_POINTS` returns.
+        frame: scan, image, camera and ground truth: labelled objects with at least five returns.
         lidar: 3D detections without non-maximum suppression.
         camera: 2D detections by camera name.
     """
@@ -41,22 +39,16 @@ class DemoFrame:
 
 
 def demo_frames(count: int = FRAMES, seed: int = 0) -> Iterator[DemoFrame]:
-    """The frames of the drive; equal seeds give equal frames."""
-    drive, views = Drive(seed), cameras()
-    for index in range(count):
+    """The first ``count`` frames of the shipped drive; ``seed`` is that of the detectors' faults.
+
+    Raises:
+        FormatError: the shipped archive is damaged.
+    """
+    for index, shipped in enumerate(read_drive(count=count)):
         rng = np.random.default_rng([seed, index])
-        street = drive.street(index)
-        points, owner = scan(street, rng)
-        images, found = {}, {}
-        in_view = np.zeros(len(street.kinds), dtype=bool)
-        for view in views:
-            image, visible = photograph(street, view, rng)
-            images[view.name] = image
-            found[view.name] = camera_detections(street, view, visible, rng)
-            in_view |= project_boxes(street.boxes, view)[1]
-        hit = np.bincount(owner[owner >= 0], minlength=len(street.kinds)) >= LEAST_POINTS
-        frame = Frame(f"{index:06d}", points, views, images, ground_truth(street, hit & in_view))
-        yield DemoFrame(frame, lidar_detections(street, owner, rng), found)
+        name = shipped.camera.name
+        frame = Frame(shipped.id, shipped.points, (shipped.camera,), {name: shipped.image}, ground_truth(shipped))
+        yield DemoFrame(frame, lidar_detections(shipped, rng), {name: camera_detections(shipped, rng)})
 
 
 def lidar_alone(lidar: Detections3D, views: Sequence[Any]) -> Detections3D:
