@@ -69,7 +69,7 @@ def test_the_same_seed_gives_the_same_bytes():
 
 def test_fusion_beats_the_lidar_alone():
     result = run_demo(list(demo_frames(6)))
-    alone, full = result.metrics["LiDAR alone"], result.metrics["matching + recovery"]
+    alone, full = result.metrics["LiDAR alone"], result.metrics["kitti: matching + recovery"]
     assert full.mean_ap > alone.mean_ap
     stages = np.concatenate([fused.stages for fused in result.fused])
     assert set(stages.tolist()) >= {0, 1}  # matched and recovered
@@ -79,5 +79,8 @@ def test_fusion_beats_the_lidar_alone():
 def test_command(tmp_path):
     result = CliRunner().invoke(app, ["demo", "--out", str(tmp_path / "d"), "--frames", "2", "--json"])
     assert result.exit_code == 0, result.output
-    assert set(json.loads(result.stdout)["variants"]) == {"LiDAR alone", "matching", "matching + recovery"}
+    assert set(json.loads(result.stdout)["variants"]) == {
+        "LiDAR alone",
+        *(f"{preset}: {parts}" for preset in ("paper", "kitti") for parts in ("matching", "matching + recovery")),
+    }
     assert sorted(p.name for p in (tmp_path / "d").iterdir()) == ["000000.png", "000001.png", "drive.gif"]

@@ -61,6 +61,9 @@ def _print(result: DemoResult, paths: list[Path]) -> None:
         )
     console = Console()
     console.print(table)
+    console.print(
+        "paper: what the camera does not confirm is deleted. kitti: it is weighed, see docs/when-fusion-helps.md"
+    )
     console.print(f"\nfusion: {result.fusion_ms:.1f} ms a frame (median). Some of its decisions:")
     for sentence in _examples(result):
         console.print(f"  {sentence}", soft_wrap=True)
@@ -68,14 +71,13 @@ def _print(result: DemoResult, paths: list[Path]) -> None:
 
 
 def _examples(result: DemoResult) -> list[str]:
-    """A sentence on a matched, a recovered and a dropped box of the frame with most recovered ones."""
+    """Sentences on matched, recovered and doubted boxes of the frame with most recovered ones."""
     import numpy as np
 
     from lcf3d.provenance import Stage
 
     fused = max(result.fused, key=lambda f: int((f.stages == Stage.RECOVERED).sum()))
-    chosen = [i for stage in (Stage.MATCHED, Stage.RECOVERED) for i in np.flatnonzero(fused.stages == stage)[:2]]
-    dropped = fused.dropped_lidar[np.argsort(-fused.lidar_inputs.scores[fused.dropped_lidar])][:2]
     name = result.frames[result.fused.index(fused)].frame.id
-    sentences = [fused.explain(int(i)) for i in chosen] + [fused.explain_lidar(int(i)) for i in dropped]
-    return [f"frame {name}: {sentence}" for sentence in sentences]
+    stages = (Stage.MATCHED, Stage.RECOVERED, Stage.KEPT)
+    chosen = [int(i) for stage in stages for i in np.flatnonzero(fused.stages == stage)[:2]]
+    return [f"frame {name}: {fused.explain(i)}" for i in chosen]
