@@ -1,9 +1,12 @@
+from pathlib import Path
+
 import numpy as np
 import pytest
 import yaml
 
 from lcf3d import FusionConfig, Lcf3dError
 from lcf3d.fusion.config import PRESETS
+from lcf3d.fusion.stereo import StereoConfig
 
 
 @pytest.mark.parametrize("name", PRESETS)
@@ -57,3 +60,9 @@ def test_priors():
     assert FusionConfig().prior_array().tolist() == [0.5] * 3
     np.testing.assert_allclose(FusionConfig(ensemble="product").prior_array(), [1 / 3] * 3)
     assert FusionConfig(priors={"Cyclist": 0.1}).prior_array().tolist() == [0.5, 0.5, 0.1]
+
+
+def test_every_setting_has_its_line_in_the_docs():
+    page = (Path(__file__).parents[2] / "docs" / "configuration.md").read_text()
+    settings = {**FusionConfig.model_fields, **StereoConfig.model_fields}
+    assert [name for name, field in settings.items() if f"| `{name}` | {field.description} |" not in page] == []
