@@ -51,10 +51,12 @@ def check_kitti(
     findings: list[Finding] = []
     absent: dict[str, list[str]] = {"scan": [], "image": [], "label": []}
     for frame_id in dataset.ids:
+        rule = "KIT01"
         try:
+            dataset.calibration(frame_id)
+            rule = "KIT02"  # with a calibration, only an image can be wrong
             frame = dataset.frame(frame_id)
         except Lcf3dError as error:
-            rule = "KIT02" if "pixels" in str(error) or "image" in str(error) else "KIT01"
             findings.append(Finding(rule, "error", str(error)))
         else:
             findings += _check_frame(dataset, frame, absent)

@@ -9,7 +9,7 @@ import numpy as np
 from lcf3d.errors import ConfigError
 from lcf3d.fusion.calibration import ScoreMap, Transform, natural_transform, transform_scores
 from lcf3d.fusion.evidence import Evidence, to_probability
-from lcf3d.structures import BoolArray, FloatArray, IntArray
+from lcf3d.structures import FloatArray, IntArray
 
 # an isotonic map is taken only where it lowers the cross-validated log loss by this share: its steps need data
 ISOTONIC_GAIN = 0.02
@@ -190,8 +190,3 @@ def block_folds(frame_ids: tuple[str, ...], count: int) -> IntArray:
     if len(frame_ids) < count:
         raise ConfigError(f"there are {len(frame_ids)} frames for {count} folds; use --folds {len(frame_ids)} or fewer")
     return np.asarray(np.arange(len(frame_ids)) * count // len(frame_ids), dtype=np.int64)
-
-
-def judged_rows(outcomes: IntArray, true_code: int, false_code: int) -> tuple[BoolArray, FloatArray]:
-    """Which detections the official protocol judges, and 1 or 0 for each of all."""
-    return (outcomes == true_code) | (outcomes == false_code), (outcomes == true_code).astype(np.float64)

@@ -133,7 +133,6 @@ class Actor:
         size: (length, width, height) in metres.
         motion: how it moves.
         mesh_at: mesh in its own frame (x forward, standing on z = 0) at a time in seconds; it fills the size.
-        animated: whether the mesh changes with time.
         stopped: a vehicle that stands in traffic instead of being parked.
     """
 
@@ -142,7 +141,6 @@ class Actor:
     size: tuple[float, float, float]
     motion: Motion
     mesh_at: Callable[[float], Mesh]
-    animated: bool = False
     stopped: bool = False
 
     def box(self, time: float, ground: float) -> tuple[float, float, float, float, float, float, float]:
@@ -267,9 +265,9 @@ def make_actor(
     if size is None:
         size = actor_size(kind, dataset, rng)
     if kind in ("pedestrian", "cyclist"):
-        return Actor(id, kind, size, motion, _person_mesh(kind, size, motion.speed, rng), motion.speed != 0, stopped)
+        return Actor(id, kind, size, motion, _person_mesh(kind, size, motion.speed, rng), stopped)
     mesh = _still_mesh(kind, size, fine, rng)
-    return Actor(id, kind, size, motion, lambda _time: mesh, False, stopped)
+    return Actor(id, kind, size, motion, lambda _time: mesh, stopped)
 
 
 def _still_mesh(kind: str, size: tuple[float, float, float], fine: bool, rng: np.random.Generator) -> Mesh:

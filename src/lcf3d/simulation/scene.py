@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -91,10 +90,6 @@ class Scene:
         """Rays onto roads, pavements and grass alone."""
         kinds = [MATERIAL_ID[name] for name in ("asphalt", "side_asphalt", "pavement", "cobbles", "grass", "earth")]
         return RayTracer(self.static.corners[np.isin(self.static.material, kinds)])
-
-    def with_actors(self, actors: Sequence[Actor]) -> Scene:
-        """The same street with other road users."""
-        return replace(self, actors=tuple(actors))
 
 
 def build_scene(

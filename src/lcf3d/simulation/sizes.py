@@ -39,19 +39,6 @@ NUSCENES_SIZES: Final[dict[str, tuple[tuple[float, float, float], tuple[float, f
 }
 """nuScenes class -> mean and deviation of (length, width, height) in metres."""
 
-KITTI_PER_FRAME: Final[dict[str, float]] = {
-    "Car": 3.868,
-    "Van": 0.349,
-    "Truck": 0.131,
-    "Pedestrian": 0.595,
-    "Person_sitting": 0.015,
-    "Cyclist": 0.198,
-    "Tram": 0.060,
-    "Misc": 0.091,
-    "DontCare": 1.454,
-}
-"""Mean number of labels a frame in KITTI's training split."""
-
 
 def draw_size(name: str, rng: np.random.Generator) -> tuple[float, float, float]:
     """(length, width, height) of an object of a KITTI or nuScenes class, within two deviations of the mean.
