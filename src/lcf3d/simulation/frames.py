@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
@@ -174,23 +174,54 @@ def capture(
     lidar_from_world = invert_rigid(stage.world_from_lidar[None])[0]
     boxes = transform_boxes(scene.boxes(time), lidar_from_world)
     sensor = np.random.default_rng([*seed, 1])
-    renders: dict[str, Render] = {}
-    sightings: dict[str, Sightings] = {}
+    seen: dict[str, tuple[Render, Sightings]] = {}
     with ThreadPoolExecutor(max(1, threads)) as pool:
         turning = pool.submit(scan, preset.lidar, stage, scene.ego.velocity(time), preset.rain, sensor)
         if images:
-            renders, sightings = _look(scene, preset, stage, boxes, seed, pool)
+            seen = _look(scene, preset, stage, boxes, seed, range(len(preset.cameras)), pool.map)
         turn = turning.result()
     points_on = np.zeros(len(boxes), dtype=np.int64)
     near = np.flatnonzero(np.hypot(boxes[:, 0], boxes[:, 1]) < preset.lidar.max_range_m + 12.0)
     points_on[near] = points_in_boxes(turn.points, boxes[near]).sum(axis=1)
+    renders = {name: picture for name, (picture, _) in seen.items()}
+    sightings = {name: sighting for name, (_, sighting) in seen.items()}
     return SimulatedFrame(id, preset, scene, time, stage.world_from_lidar, turn, renders, boxes, points_on, sightings)
 
 
+def look(
+    scene: Scene, preset: Preset, cameras: Sequence[Camera], time: float, seed: tuple[int, ...]
+) -> dict[str, tuple[Render, Sightings]]:
+    """Images of some cameras of a preset without a LiDAR scan, and what they show of the actors.
+
+    Args:
+        scene: the street.
+        preset: sensors and weather.
+        cameras: those of the preset to render.
+        time: seconds into the drive.
+        seed: of the sensor noise.
+
+    Returns:
+        By camera name.
+
+    Raises:
+        MissingExtraError: embreex is not installed.
+    """
+    stage = make_stage(scene, preset, time)
+    boxes = transform_boxes(scene.boxes(time), invert_rigid(stage.world_from_lidar[None])[0])
+    wanted = [number for number, camera in enumerate(preset.cameras) if camera in cameras]
+    return _look(scene, preset, stage, boxes, seed, wanted, map)
+
+
 def _look(
-    scene: Scene, preset: Preset, stage: Stage, boxes: FloatArray, seed: tuple[int, ...], pool: ThreadPoolExecutor
-) -> tuple[dict[str, Render], dict[str, Sightings]]:
-    """Images and sightings of all cameras."""
+    scene: Scene,
+    preset: Preset,
+    stage: Stage,
+    boxes: FloatArray,
+    seed: tuple[int, ...],
+    numbers: Sequence[int],
+    map_: Callable[..., Iterable[tuple[Render, Sightings]]],
+) -> dict[str, tuple[Render, Sightings]]:
+    """Image and sightings of the cameras of those numbers, by name."""
     corners = [stage.mesh.corners[stage.owner == actor.id] for actor in scene.actors]
     shared = measure_exposure(preset.cameras[0], stage)
 
@@ -201,12 +232,7 @@ def _look(
         picture = render(camera, stage, rng, exposure)
         return picture, sight(camera, picture.owner, scene.actors, corners, boxes, stage.world_from_lidar)
 
-    numbers = range(len(preset.cameras))
-    results = list(pool.map(one, numbers))
-    names = [camera.name for camera in preset.cameras]
-    return {n: r for n, (r, _) in zip(names, results, strict=True)}, {
-        n: s for n, (_, s) in zip(names, results, strict=True)
-    }
+    return dict(zip((preset.cameras[number].name for number in numbers), map_(one, numbers), strict=True))
 
 
 def make_stage(scene: Scene, preset: Preset, time: float) -> Stage:
