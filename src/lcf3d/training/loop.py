@@ -1,0 +1,347 @@
+"""The training loop that all networks share: schedule, checkpoints, resuming, TensorBoard, several processes.
+
+Everything random in step ``n`` comes from the seed and ``n`` alone, so a training that was interrupted at any moment
+and resumed ends with the same weights as one that was not.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from lcf3d.errors import ConfigError, DetectorError, MissingExtraError
+from lcf3d.formats.files import atomic_path, write_json
+
+LAST, FORMAT = "last.pt", "lcf3d-training-1"
+
+
+@dataclass(frozen=True)
+class TrainingSettings:
+    """How long and how fast to train.
+
+    Attributes:
+        steps: batches of the whole training.
+        learning_rate: the highest one, reached after the warm-up and then lowered to zero along a half cosine.
+        warmup: share of the steps in which the learning rate rises.
+        weight_decay: of AdamW, on weights of more than one dimension.
+        clip: largest norm of the gradient.
+        seed: of weights, batches and dropout.
+        average: decay of the running average of the weights that is validated and exported; 0 for none.
+        checkpoint_every: steps between checkpoints; validation takes place at each.
+        workers: processes that prepare batches; 0 prepares them in the training's own.
+    """
+
+    steps: int
+    learning_rate: float = 1e-3
+    warmup: float = 0.05
+    weight_decay: float = 0.01
+    clip: float = 10.0
+    seed: int = 0
+    average: float = 0.999
+    checkpoint_every: int = 500
+    workers: int = 0
+
+    def __post_init__(self) -> None:
+        if self.steps < 1 or self.checkpoint_every < 1:
+            raise ConfigError(f"steps must be 1 or more, got {self.steps} and checkpoint_every {self.checkpoint_every}")
+        if not self.learning_rate > 0:
+            raise ConfigError(f"learning_rate must be above 0, got {self.learning_rate}")
+
+    def rate(self, step: int) -> float:
+        """Learning rate of a step."""
+        rising = max(1.0, self.warmup * self.steps)
+        if step < rising:
+            return self.learning_rate * (step + 1) / rising
+        done = (step - rising) / max(1.0, self.steps - rising)
+        return self.learning_rate * 0.5 * (1 + math.cos(math.pi * min(1.0, done)))
+
+
+class TrainingTask(Protocol):
+    """What is trained: a network, its batches, its loss and its measure."""
+
+    def network(self) -> Any:
+        """A new torch module with random weights (torch's generator is seeded before)."""
+        ...
+
+    def batch(self, step: int, rng: np.random.Generator) -> Any:
+        """The batch of a step as nested tuples, lists or dicts of tensors; all that is random comes from ``rng``."""
+        ...
+
+    def loss(self, network: Any, batch: Any) -> dict[str, Any]:
+        """Weighted scalar terms by name; their sum is minimised. ``network`` may be wrapped for several processes."""
+        ...
+
+    def validate(self, network: Any) -> dict[str, float]:
+        """Figures of the network (in evaluation mode) on held-out samples; may be empty."""
+        ...
+
+
+@dataclass(frozen=True)
+class Progress:
+    """What is reported after a step.
+
+    Attributes:
+        step: steps done.
+        loss: sum of the terms.
+        terms: each term.
+        validation: figures, after steps that validate.
+    """
+
+    step: int
+    loss: float
+    terms: dict[str, float]
+    validation: dict[str, float]
+
+
+def train(
+    task: TrainingTask,
+    settings: TrainingSettings,
+    folder: Path,
+    resume: bool = False,
+    report: Callable[[Progress], None] = lambda _: None,
+) -> Any:
+    """Train a network; gives it with the averaged weights, in evaluation mode.
+
+    ``folder`` receives ``last.pt`` (everything to go on from), ``settings.json``, ``metrics.json`` and TensorBoard's
+    event files. Under torchrun every process works on its own batches and gradients are averaged.
+
+    Args:
+        task: what to train.
+        settings: how.
+        folder: for checkpoints; must hold none unless ``resume``.
+        resume: go on from the folder's checkpoint, if there is one.
+        report: called after every step.
+
+    Raises:
+        ConfigError: the folder holds a training already, or one with other settings.
+        DetectorError: the loss is not finite (the last good checkpoint stays), or the checkpoint is another network's.
+        MissingExtraError: torch is not installed.
+    """
+    torch = import_torch()
+    rank, world = _join(torch)
+    run = _Run(torch, task, settings, folder, rank)
+    first = run.resume() if resume else run.begin()
+    network = run.network
+    if world > 1:
+        network = torch.nn.parallel.DistributedDataParallel(network, broadcast_buffers=False)
+    network.train()
+    for step, batch in _batches(task, settings, first, rank):
+        torch.manual_seed(_seed(settings.seed, step, rank, 1))
+        for group in run.optimizer.param_groups:
+            group["lr"] = settings.rate(step)
+        terms = task.loss(network, batch)
+        total = sum(terms.values())
+        _require_finite(terms, step, folder)
+        run.optimizer.zero_grad(set_to_none=True)
+        total.backward()
+        torch.nn.utils.clip_grad_norm_(run.network.parameters(), settings.clip)
+        run.optimizer.step()
+        run.average(step)
+        done, figures = step + 1, {}
+        if done % settings.checkpoint_every == 0 or done == settings.steps:
+            figures = run.save(done)
+            run.network.train()
+        report(run.note(done, terms, figures))
+    run.close()
+    return run.averaged
+
+
+class _Run:
+    """The state of a training: network, optimizer, averaged weights, and where they are kept."""
+
+    def __init__(self, torch: Any, task: TrainingTask, settings: TrainingSettings, folder: Path, rank: int) -> None:
+        self.torch, self.task, self.settings, self.folder, self.rank = torch, task, settings, folder, rank
+        torch.manual_seed(settings.seed)
+        self.network = task.network()
+        self.averaged = task.network()
+        self.averaged.load_state_dict(self.network.state_dict())
+        self.averaged.eval().requires_grad_(False)
+        decayed = [p for p in self.network.parameters() if p.requires_grad and p.ndim > 1]
+        others = [p for p in self.network.parameters() if p.requires_grad and p.ndim <= 1]
+        groups = [{"params": decayed, "weight_decay": settings.weight_decay}, {"params": others, "weight_decay": 0.0}]
+        self.optimizer = torch.optim.AdamW(groups, lr=settings.learning_rate)
+        self.history: list[dict[str, Any]] = []
+        self._writer: Any = None
+
+    def begin(self) -> int:
+        if (self.folder / LAST).exists():
+            raise ConfigError(f"{self.folder} holds a training already; go on with --resume, or choose another folder")
+        if self.rank == 0:
+            write_json(self.folder / "settings.json", asdict(self.settings))
+        return 0
+
+    def resume(self) -> int:
+        """Load the checkpoint; gives the steps done."""
+        path = self.folder / LAST
+        if not path.exists():
+            return self.begin()
+        state = load_checkpoint(path)
+        if state["settings"] != asdict(self.settings):
+            raise ConfigError(f"{path} was trained with other settings ({state['settings']}); use the same to go on")
+        fill(self.network, state["network"], str(path))
+        fill(self.averaged, state["averaged"], str(path))
+        self.optimizer.load_state_dict(state["optimizer"])
+        self.history = list(state["history"])
+        return int(state["step"])
+
+    def average(self, step: int) -> None:
+        """Move the averaged weights towards the network's."""
+        decay = min(self.settings.average, (1 + step) / (10 + step))
+        with self.torch.no_grad():
+            for kept, new in zip(self.averaged.state_dict().values(), self.network.state_dict().values(), strict=True):
+                if kept.dtype.is_floating_point:
+                    kept.lerp_(new, 1 - decay)
+                else:
+                    kept.copy_(new)
+
+    def save(self, done: int) -> dict[str, float]:
+        """Validate and write the checkpoint, whole or not at all; gives the validation's figures."""
+        if self.rank != 0:
+            return {}
+        with self.torch.no_grad():
+            figures = self.task.validate(self.averaged)
+        self.history.append({"step": done, **figures})
+        state = {
+            "format": FORMAT,
+            "step": done,
+            "settings": asdict(self.settings),
+            "network": self.network.state_dict(),
+            "averaged": self.averaged.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+            "history": self.history,
+        }
+        with atomic_path(self.folder / LAST) as temporary:
+            self.torch.save(state, temporary)
+        write_json(self.folder / "metrics.json", self.history)
+        return figures
+
+    def note(self, done: int, terms: dict[str, Any], figures: dict[str, float]) -> Progress:
+        """What to report, after writing it to TensorBoard."""
+        values = {name: float(value.detach()) for name, value in terms.items()}
+        progress = Progress(done, sum(values.values()), values, figures)
+        if self.rank == 0 and (done % 20 == 0 or figures):
+            writer = self._tensorboard()
+            for name, value in {"loss": progress.loss, **values}.items():
+                writer.add_scalar(f"train/{name}", value, done)
+            for name, value in figures.items():
+                writer.add_scalar(f"validation/{name}", value, done)
+        return progress
+
+    def _tensorboard(self) -> Any:
+        if self._writer is None:
+            try:
+                from torch.utils.tensorboard import SummaryWriter
+            except ModuleNotFoundError:
+                raise MissingExtraError("tensorboard", "train", "training") from None
+            self._writer = SummaryWriter(str(self.folder / "tensorboard"))
+        return self._writer
+
+    def close(self) -> None:
+        if self._writer is not None:
+            self._writer.close()
+
+
+def import_torch() -> Any:
+    """torch, or a sentence that says how to install it.
+
+    Raises:
+        MissingExtraError: torch is not installed.
+    """
+    try:
+        import torch
+    except ModuleNotFoundError:
+        raise MissingExtraError("torch", "train", "training") from None
+    return torch
+
+
+def load_checkpoint(path: Path) -> dict[str, Any]:
+    """The content of a ``last.pt``; no code in it is executed.
+
+    Raises:
+        DetectorError: the file is absent, damaged or no checkpoint of `train`.
+    """
+    torch = import_torch()
+    if not path.is_file():
+        raise DetectorError(f"training checkpoint {path} does not exist")
+    try:
+        state = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:
+        # torch raises errors of many unrelated classes for torn files
+        reason = str(error).splitlines()[0][:120] if str(error) else type(error).__name__
+        raise DetectorError(f"training checkpoint {path} is damaged ({reason})") from None
+    if not isinstance(state, dict) or state.get("format") != FORMAT:
+        raise DetectorError(f"{path} is no training checkpoint of lcf3d")
+    return state
+
+
+def fill(network: Any, state: dict[str, Any], source: str) -> None:
+    """Load parameters into a network of the same architecture.
+
+    Raises:
+        DetectorError: they are another network's; names the first parameter that does not fit.
+    """
+    expected = network.state_dict()
+    for name, value in expected.items():
+        if name not in state:
+            raise DetectorError(f"{source} is of another architecture: it has no parameter {name!r}")
+        if state[name].shape != value.shape:
+            raise DetectorError(
+                f"{source} is of another architecture: {name!r} has shape {tuple(state[name].shape)}, "
+                f"expected {tuple(value.shape)}"
+            )
+    extra = next((name for name in state if name not in expected), None)
+    if extra is not None:
+        raise DetectorError(f"{source} is of another architecture: it has a parameter {extra!r} that is not expected")
+    network.load_state_dict(state)
+
+
+def _seed(*parts: int) -> int:
+    return int(np.random.default_rng(list(parts)).integers(2**62))
+
+
+def _batches(task: TrainingTask, settings: TrainingSettings, first: int, rank: int) -> Iterator[tuple[int, Any]]:
+    """Number and batch of every step from ``first`` on."""
+    steps = _Steps(task, settings.seed, rank)
+    if settings.workers == 0:
+        for step in range(first, settings.steps):
+            yield step, steps[step]
+        return
+    data = import_torch().utils.data
+    numbers = range(first, settings.steps)
+    loader = data.DataLoader(
+        steps, batch_size=None, sampler=numbers, num_workers=settings.workers, persistent_workers=True
+    )
+    yield from zip(numbers, loader, strict=True)
+
+
+class _Steps:
+    """Batches by step, as a map-style dataset."""
+
+    def __init__(self, task: TrainingTask, seed: int, rank: int) -> None:
+        self.task, self.seed, self.rank = task, seed, rank
+
+    def __getitem__(self, step: int) -> Any:
+        return self.task.batch(step, np.random.default_rng([self.seed, step, self.rank]))
+
+
+def _require_finite(terms: dict[str, Any], step: int, folder: Path) -> None:
+    bad = [name for name, value in terms.items() if not math.isfinite(float(value.detach()))]
+    if bad:
+        kept = f"{folder / LAST} is the last good checkpoint" if (folder / LAST).exists() else "no checkpoint yet"
+        raise DetectorError(
+            f"the loss {bad[0]!r} of step {step} is not finite; {kept}: lower the learning rate, or look at the data"
+        )
+
+
+def _join(torch: Any) -> tuple[int, int]:
+    """Rank and number of the processes; joins the group under torchrun."""
+    world = int(os.environ.get("WORLD_SIZE", "1"))
+    if world > 1 and not torch.distributed.is_initialized():
+        torch.distributed.init_process_group("gloo")
+    return int(os.environ.get("RANK", "0")), world
