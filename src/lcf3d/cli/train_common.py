@@ -1,0 +1,71 @@
+"""What the training commands share: samples under a progress bar, training under a progress bar."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from lcf3d.training.loop import TrainingSettings, TrainingTask
+    from lcf3d.training.samples import SampleRecipe
+
+
+def default_samples_root() -> Path:
+    """Where simulated samples are kept between trainings: ``lcf3d/samples`` in the user's cache folder."""
+    return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "lcf3d" / "samples"
+
+
+def prepare_samples(recipe: SampleRecipe, root: Path, jobs: int) -> list[Path]:
+    """Paths of all samples of a recipe, those that are missing in its folder of ``root`` simulated.
+
+    Raises:
+        ConfigError: the folder holds another set.
+        MissingExtraError: embreex is not installed and something is missing.
+    """
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    from lcf3d.training.samples import write_samples
+
+    columns = (TextColumn("simulating samples"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True)) as bar:
+        task = bar.add_task("samples", total=recipe.frames)
+        return write_samples(recipe, root / recipe.folder, jobs, lambda n: bar.advance(task, n))
+
+
+def train_with_progress(task: TrainingTask, settings: TrainingSettings, out: Path, resume: bool) -> Any:
+    """`lcf3d.training.loop.train` under a progress bar that shows loss and the last validation; gives the network.
+
+    Raises:
+        ConfigError: see `lcf3d.training.loop.train`.
+        DetectorError: see there.
+        MissingExtraError: torch is not installed.
+    """
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+    from rich.progress import Progress as Bar
+
+    from lcf3d.training.loop import Progress, train
+
+    console = Console(stderr=True)
+    columns = (
+        TextColumn("training"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+        TextColumn("{task.fields[loss]}"),
+    )
+    smooth = 0.0
+    with Bar(*columns, console=console) as bar:
+        row = bar.add_task("steps", total=settings.steps, loss="")
+
+        def report(progress: Progress) -> None:
+            nonlocal smooth
+            smooth = progress.loss if smooth == 0.0 else 0.98 * smooth + 0.02 * progress.loss
+            bar.update(row, completed=progress.step, loss=f"loss {smooth:.3f}")
+            if progress.validation:
+                figures = "  ".join(f"{name} {value:.3f}" for name, value in progress.validation.items())
+                console.print(f"step {progress.step}: loss {smooth:.3f}  {figures}", soft_wrap=True)
+
+        return train(task, settings, out, resume, report)
