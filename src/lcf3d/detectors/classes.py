@@ -19,6 +19,7 @@ out; nuScenes includes a rider in the box of the bicycle or motorcycle. `join_ri
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 
@@ -49,6 +50,16 @@ SYNONYMS: Mapping[str, tuple[str, ...]] = {
     "motorcyclist": ("motorcyclist", "motorcycle", "cyclist"),
     "van": ("van", "car"),
 }
+
+
+def read_class_names(names: str | Sequence[str]) -> tuple[str, ...]:
+    """Class names from a sequence, a comma-separated string or a text file with one name a line."""
+    if not isinstance(names, str):
+        return tuple(names)
+    if Path(names).is_file():
+        lines = Path(names).read_text(encoding="utf-8").splitlines()
+        return tuple(line.strip() for line in lines if line.strip())
+    return tuple(name.strip() for name in names.split(",") if name.strip())
 
 
 def class_mapping(source: Sequence[str], target: Sequence[str]) -> dict[str, str]:

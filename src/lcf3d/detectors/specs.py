@@ -38,6 +38,7 @@ KINDS: dict[Sensor, dict[str, str]] = {
         "onnx": "lcf3d.detectors.camera.onnx:OnnxDetector",
         "results": "lcf3d.detectors.results:CameraResults",
         "fasterrcnn": "lcf3d.detectors.camera.torchvision_fasterrcnn:TorchvisionFasterRCNN",
+        "torchvision": "lcf3d.detectors.camera.torchvision_models:TorchvisionDetector",
         "mmdet": "lcf3d.detectors.camera.mmdet:MmdetDetector",
     },
     "lidar": {

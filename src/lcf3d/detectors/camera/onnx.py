@@ -14,7 +14,7 @@ from lcf3d.detectors.base import Image
 from lcf3d.detectors.camera.onnx_images import instance_masks, prepare_image
 from lcf3d.detectors.camera.onnx_layouts import LAYOUTS, SIZES_INPUT, class_count, identify_layout
 from lcf3d.detectors.camera.tiling import merge_tiles, non_maximum_suppression, tile_spans
-from lcf3d.detectors.classes import COCO_CLASSES, to_classes
+from lcf3d.detectors.classes import COCO_CLASSES, read_class_names, to_classes
 from lcf3d.errors import ConfigError, DetectorError, ShapeError
 from lcf3d.structures import KITTI_CLASSES, Detections2D
 
@@ -200,7 +200,7 @@ class OnnxDetector:
         self, given: str | Sequence[str] | None, metadata: Mapping[str, str], count: int | None
     ) -> tuple[str, ...]:
         """The network's own class names, from the user, its metadata or COCO; checked against their number."""
-        names = _read_names(given) if given is not None else _metadata_names(metadata)
+        names = read_class_names(given) if given is not None else _metadata_names(metadata)
         if names is None and count in (None, len(COCO_CLASSES)):
             names = COCO_CLASSES
         if names is None:
@@ -251,15 +251,6 @@ def _parse_size(size: int | str | None) -> tuple[int, int] | None:
     if height < 32 or width < 32 or height % 32 or width % 32:
         raise ConfigError(f"size must be a multiple of 32 pixels or HEIGHTxWIDTH of such, got {size!r}")
     return height, width
-
-
-def _read_names(names: str | Sequence[str]) -> tuple[str, ...]:
-    if not isinstance(names, str):
-        return tuple(names)
-    if Path(names).is_file():
-        lines = Path(names).read_text(encoding="utf-8").splitlines()
-        return tuple(line.strip() for line in lines if line.strip())
-    return tuple(name.strip() for name in names.split(",") if name.strip())
 
 
 def _metadata_names(metadata: Mapping[str, str]) -> tuple[str, ...] | None:
