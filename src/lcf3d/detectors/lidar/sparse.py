@@ -1,7 +1,8 @@
 """Sparse 3D convolution in plain torch: gather the inputs of every output, multiply with the kernel.
 
 Sites (the active cells) know which input meets which output at every kernel offset; this is worked out once and shared
-by all convolutions between the same sites. Weights are (kz, ky, kx, in, out).
+by all convolutions between the same sites. Weights are (kz, ky, kx, in, out). On a GPU with spconv installed, spconv
+does the same (`sparse_spconv`).
 """
 
 # mypy: allow-subclassing-any
@@ -10,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+from lcf3d.detectors.lidar import sparse_spconv
 from lcf3d.detectors.lidar._torch import Tensor, functional, nn, torch
 
 Triple = tuple[int, int, int]
@@ -23,11 +25,13 @@ class Sites:
     Args:
         coordinates: (N, 4) int64 ``batch, z, y, x``, all different.
         shape: cells along z, y, x.
+        spconv_indices: what spconv has worked out about these sites.
     """
 
-    def __init__(self, coordinates: Tensor, shape: Triple) -> None:
+    def __init__(self, coordinates: Tensor, shape: Triple, spconv_indices: dict[str, Any] | None = None) -> None:
         self.coordinates = coordinates
         self.shape = shape
+        self.spconv_indices = {} if spconv_indices is None else spconv_indices
         self._sorted_keys, self._order = torch.sort(flat_keys(coordinates, shape))
         self._submanifold: dict[Triple, Tensor] = {}
         self._strided: dict[tuple[Triple, Triple, Triple], tuple[Sites, Tensor]] = {}
@@ -169,12 +173,19 @@ class SparseConvolution(nn.Module):
             parts.append(functional.linear(gathered, weight.t(), self.bias))
         return torch.cat(parts)
 
+    def biased(self, features: Tensor) -> Tensor:
+        """(M, out) features with the bias, if normalization was folded into one."""
+        return features if self.bias is None else features + self.bias
+
 
 class SubmanifoldConv(SparseConvolution):
     """Convolution whose outputs are the sites of its input (Graham et al., 2018)."""
 
     def forward(self, x: SparseTensor) -> SparseTensor:
         """Features at the same sites."""
+        library = sparse_spconv.spconv_for(x.features)
+        if library is not None:
+            return x.with_features(self.biased(sparse_spconv.submanifold(library, self.weight, x.features, x.sites)))
         return x.with_features(self.convolve(x.features, x.sites.submanifold_table(self.kernel)))
 
 
@@ -195,6 +206,10 @@ class StridedConv(SparseConvolution):
 
     def forward(self, x: SparseTensor) -> SparseTensor:
         """Features at the output sites."""
+        library = sparse_spconv.spconv_for(x.features)
+        if library is not None:
+            features, cells, shape, made = sparse_spconv.strided(library, self, x.features, x.sites)
+            return SparseTensor(self.biased(features), Sites(cells, shape, made))
         sites, table = x.sites.strided_table(self.kernel, self.stride, self.padding)
         return SparseTensor(self.convolve(x.features, swap_table(table, len(sites))), sites)
 
@@ -204,6 +219,9 @@ class InverseConv(SparseConvolution):
 
     def forward(self, x: SparseTensor, fine: Sites, strided: StridedConv) -> SparseTensor:
         """Features at the ``fine`` sites, from which ``strided`` made those of ``x``."""
+        library = sparse_spconv.spconv_for(x.features)
+        if library is not None:
+            return SparseTensor(self.biased(sparse_spconv.inverse(library, self.weight, x.features, x.sites)), fine)
         _, table = fine.strided_table(strided.kernel, strided.stride, strided.padding)
         return SparseTensor(self.convolve(x.features, table), fine)
 
