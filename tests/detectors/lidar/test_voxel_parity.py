@@ -1,12 +1,13 @@
 """Sparse-convolution networks against the original implementations.
 
 The recorded sparse maps are damaged: `second_kitti`, `parta2_kitti` and `pvrcnn_kitti` have the same encoder weights
-and the same scan, and record three different maps after it (absolute maxima 664.2, 663.1 and 722.2). The original
-computed them with spconv on two cores, and spconv 2.3.8 adds up on the CPU through pointers that its threads share: with
-one thread it gives our maps (maximum 700.47, `test_the_encoders_are_those_of_spconv`), with two others in every run, with
-0.01 to 3 % of the rows off after the first stage and 40 to 80 % after the fourth, as in the recording (3 % of its
-sampled values, then 34, 80 and 94 %). So what comes before and beside the sparse convolutions is compared exactly here,
-and what comes after them by its statistics.
+and the same scan, and record three different maps after it (absolute maxima 664.2, 663.1 and 722.2). They must have
+been computed with spconv (mmcv's own sparse convolution has no CPU form), and spconv 2.3.8 adds up on the CPU through
+pointers that its threads share. With one thread it gives our maps (maximum 700.47), which is what
+`test_the_encoders_are_those_of_spconv` checks where it is installed. With two it gives others in every run, with 0.01
+to 3 % of the rows off after the first stage and 40 to 80 % after the fourth; of the recorded values 3 % are, then 34,
+80 and 94 %. So what comes before and beside the sparse convolutions is compared exactly here, and what comes after
+them by its statistics.
 """
 
 from __future__ import annotations
