@@ -13,6 +13,7 @@ from importlib import import_module
 from typing import Any
 
 _MODULES = {
+    "CompactPillars": "compact",
     "PointPillars": "pointpillars",
     "SECOND": "second",
     "SSN": "ssn",

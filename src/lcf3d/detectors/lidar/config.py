@@ -79,6 +79,7 @@ class CenterSpec:
         limits: ``(x, y, z)`` lower, then upper corner that kept centres lie in, in metres.
         max_per_task: boxes kept of each task after suppression.
         max_candidates: heat-map peaks taken of each task.
+        velocity: whether the head predicts velocities.
     """
 
     tasks: tuple[tuple[str, ...], ...]
@@ -86,6 +87,7 @@ class CenterSpec:
     limits: tuple[float, float, float, float, float, float] = (-61.2, -61.2, -10.0, 61.2, 61.2, 10.0)
     max_per_task: int = 83
     max_candidates: int = 500
+    velocity: bool = True
 
 
 @dataclass(frozen=True)
@@ -121,6 +123,8 @@ class LidarConfig:
         proposals: first stage of two-stage detectors.
         variant: which of the architecture's networks, for example the backbone of SSN.
         offsets_replace_position: see `lcf3d.detectors.lidar.voxelization.decorate`.
+        encoding: what the encoder sees of a pillar: its ``points``, or their ``statistics`` (see
+            `lcf3d.detectors.lidar.statistics`).
     """
 
     name: str
@@ -134,11 +138,14 @@ class LidarConfig:
     proposals: Suppression | None = None
     variant: str = ""
     offsets_replace_position: bool = False
+    encoding: str = "points"
 
     @property
     def has_velocity(self) -> bool:
         """Whether the network predicts velocities."""
-        return self.centers is not None or (self.anchors is not None and self.anchors.code_size == 9)
+        if self.centers is not None:
+            return self.centers.velocity
+        return self.anchors is not None and self.anchors.code_size == 9
 
     def with_candidates(self, count: int) -> LidarConfig:
         """The configuration with ``count`` candidates before suppression (of two-stage networks: regions to refine).
@@ -166,7 +173,8 @@ class LidarConfig:
             ConfigError: ``value`` is not such a dictionary.
         """
         try:
-            values = {field.name: _tuples(value[field.name]) for field in fields(cls)}
+            # a file written before a setting existed holds its default
+            values = {field.name: _tuples(value[field.name]) for field in fields(cls) if field.name in value}
             values["voxels"] = VoxelSpec(**values["voxels"])
             for name, kind in (("suppression", Suppression), ("proposals", Suppression), ("centers", CenterSpec)):
                 values[name] = None if values[name] is None else kind(**values[name])

@@ -165,8 +165,8 @@ def decode_center_maps(
     """Boxes, scores and labels of a centre head (section 4 of the CenterPoint paper), suppressed task by task.
 
     Args:
-        tasks: for each task the maps ``heatmap`` (K, H, W), ``reg`` (2), ``height`` (1), ``dim`` (3), ``rot`` (2) and
-            ``vel`` (2), all at one resolution.
+        tasks: for each task the maps ``heatmap`` (K, H, W), ``reg`` (2), ``height`` (1), ``dim`` (3), ``rot`` (2) and,
+            of networks that predict velocities, ``vel`` (2), all at one resolution.
         config: a configuration with ``centers``.
         score_threshold: boxes need a higher score.
         nms: the mode of suppression.
@@ -193,18 +193,19 @@ def decode_center_maps(
 
 
 def _center_boxes(maps: Mapping[str, Map], cells: IntArray, config: LidarConfig) -> FloatArray:
-    """(N, 9) boxes at the given flat cells of a task's maps."""
+    """(N, 7 or 9) boxes at the given flat cells of a task's maps."""
     assert config.centers is not None
     values = {name: m.reshape(len(m), -1)[:, cells].astype(np.float64) for name, m in maps.items() if name != "heatmap"}
     row, column = np.divmod(cells, maps["heatmap"].shape[2])
     step = np.array(config.voxels.size[:2]) * config.centers.stride
-    boxes = np.empty((len(cells), 9))
+    boxes = np.empty((len(cells), 9 if config.has_velocity else 7))
     boxes[:, 0] = (column + values["reg"][0]) * step[0] + config.voxels.area[0]
     boxes[:, 1] = (row + values["reg"][1]) * step[1] + config.voxels.area[1]
     boxes[:, 3:6] = np.exp(np.minimum(values["dim"], 88.0)).T
     boxes[:, 2] = values["height"][0] - boxes[:, 5] / 2
     boxes[:, 6] = np.arctan2(values["rot"][0], values["rot"][1])
-    boxes[:, 7:] = values["vel"].T
+    if config.has_velocity:
+        boxes[:, 7:] = values["vel"].T
     return boxes
 
 

@@ -69,9 +69,22 @@ class HardVFE(nn.Module):
         return pillar_maximum(second(torch.cat([points, pooled[pillar]], dim=1)), pillar, padding)
 
 
-def scatter_pillars(features: Tensor, cells: Tensor, height: int, width: int) -> Tensor:
-    """(1, C, H, W) map with the (P, C) features at the (P,) int64 flat cells and zero elsewhere."""
-    canvas = features.new_zeros(height * width, features.shape[1])
+class StatisticsEncoder(nn.Module):
+    """Two layers on the statistics of a pillar (`lcf3d.detectors.lidar.statistics`)."""
+
+    def __init__(self, in_channels: int, hidden: int, out_channels: int) -> None:
+        super().__init__()
+        self.layers = nn.Sequential(PointLayer(in_channels, hidden), PointLayer(hidden, out_channels))
+
+    def forward(self, features: Tensor) -> Tensor:
+        """(P, out) pillar features of (P, in) statistics."""
+        encoded: Tensor = self.layers(features)
+        return encoded
+
+
+def scatter_pillars(features: Tensor, cells: Tensor, height: int, width: int, scans: int = 1) -> Tensor:
+    """(scans, C, H, W) maps with the (P, C) features at the (P,) int64 flat cells and zero elsewhere."""
+    canvas = features.new_zeros(scans * height * width, features.shape[1])
     canvas = canvas.index_put((cells,), features)
     # channels stay innermost in memory, which convolutions on a CPU prefer
-    return canvas.reshape(1, height, width, -1).permute(0, 3, 1, 2)
+    return canvas.reshape(scans, height, width, -1).permute(0, 3, 1, 2)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from lcf3d.detectors.lidar.config import LidarConfig
 from lcf3d.detectors.lidar.decoding import decode_anchor_maps, decode_center_maps, detections, select_by_class
+from lcf3d.detectors.lidar.statistics import pillar_statistics
 from lcf3d.detectors.lidar.suppression import NmsMode
 from lcf3d.detectors.lidar.voxelization import Voxels, decorate, in_area, select_channels, voxelize
 from lcf3d.structures import Detections3D
@@ -38,6 +39,17 @@ def pillar_inputs(points: NDArray[np.floating], config: LidarConfig) -> Inputs |
         "padded": (voxels.counts < config.voxels.max_points).astype(np.float32)[:, None],
         "cells": voxels.coordinates[:, 1] * width + voxels.coordinates[:, 2],
     }
+
+
+def encoder_inputs(points: NDArray[np.floating], config: LidarConfig) -> Inputs | None:
+    """Inputs of a pillar network by name, in the encoding of its configuration: points or statistics of pillars.
+
+    None when no point lies in its range.
+    """
+    if config.encoding == "points":
+        return pillar_inputs(points, config)
+    features, cells = pillar_statistics(points, config.voxels)
+    return {"features": features, "cells": cells} if len(cells) else None
 
 
 def voxel_inputs(voxels: Voxels) -> Inputs:

@@ -14,7 +14,11 @@ from lcf3d.detectors.base import LidarDetector
 from lcf3d.detectors.checkpoints import detector_class, read_lidar_checkpoint
 from lcf3d.detectors.classes import class_mapping
 from lcf3d.detectors.lidar.suppression import NmsMode
+from lcf3d.errors import DetectorError
 from lcf3d.structures import Detections3D
+
+MODELS = Path(__file__).parents[2] / "models"
+"""Where the networks lie that come with the package."""
 
 
 @dataclass(frozen=True)
@@ -83,3 +87,29 @@ def onnx_lidar(
 
     detector = OnnxLidarDetector(path, nms=nms, score_threshold=score_threshold, threads=threads, candidates=candidates)
     return detector if class_names is None else InClasses(detector, tuple(class_names))
+
+
+def shipped(
+    name: str,
+    class_names: Sequence[str] | None = None,
+    nms: NmsMode = "off",
+    score_threshold: float | None = None,
+    threads: int = 0,
+) -> LidarDetector:
+    """A network that comes with lcf3d, run by onnxruntime: ``kitti`` finds cars, pedestrians and cyclists.
+
+    Args:
+        name: of the network.
+        class_names: classes of the detections; the network's own without it.
+        nms: ``off`` as in the paper, ``low`` or ``keep``.
+        score_threshold: boxes need a higher score; the network's own without it.
+        threads: threads of onnxruntime; 0 for one a core.
+
+    Raises:
+        DetectorError: there is no network of that name.
+    """
+    path = MODELS / f"lidar_{name}.onnx"
+    if not path.is_file():
+        known = ", ".join(sorted(p.stem.removeprefix("lidar_") for p in MODELS.glob("lidar_*.onnx"))) or "none"
+        raise DetectorError(f"lcf3d ships no LiDAR network {name!r}; it has: {known}")
+    return onnx_lidar(str(path), class_names, nms, score_threshold, threads)

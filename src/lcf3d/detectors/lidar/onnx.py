@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lcf3d.detectors.lidar.config import LidarConfig
-from lcf3d.detectors.lidar.inputs import map_detections, pillar_inputs
+from lcf3d.detectors.lidar.inputs import encoder_inputs, map_detections
 from lcf3d.detectors.lidar.suppression import NmsMode, suppression_threshold
 from lcf3d.errors import ConfigError, DetectorError
 from lcf3d.structures import Detections3D
@@ -60,14 +60,14 @@ class OnnxLidarDetector:
 
     def __call__(self, points: NDArray[np.floating]) -> Detections3D:
         """Detections in (N, 4 or more) points, as of `lcf3d.detectors.lidar.detector.TorchLidarDetector`."""
-        inputs = pillar_inputs(points, self.config)
+        inputs = encoder_inputs(points, self.config)
         if inputs is None:
             velocities = np.zeros((0, 2)) if self.config.has_velocity else None
             return Detections3D(np.zeros((0, 7)), np.zeros(0), np.zeros(0, np.int64), self.class_names, velocities)
         return map_detections(self.maps(inputs), self.config, self.score_threshold, self.nms)
 
     def maps(self, inputs: dict[str, NDArray[Any]]) -> list[Any]:
-        """The head's maps, without batch axis, from the arrays of `pillar_inputs`."""
+        """The head's maps, without batch axis, from the arrays of `encoder_inputs`."""
         names = [output.name for output in self._session.get_outputs()]
         values = [value[0] for value in self._session.run(names, inputs)]
         groups: dict[str, dict[str, Any]] = {}

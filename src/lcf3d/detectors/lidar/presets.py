@@ -188,6 +188,25 @@ def openpcdet(config: LidarConfig) -> LidarConfig:
     )
 
 
+# not among `PRESETS`, which are the networks with published checkpoints
+COMPACT_KITTI = LidarConfig(
+    name="compact-kitti",
+    architecture="compact-pillars",
+    class_names=("Car", "Pedestrian", "Cyclist"),
+    channels=_KITTI_CHANNELS,
+    voxels=VoxelSpec((0.32, 0.32, 4.0), (0.0, -39.68, -3.0, 69.12, 39.68, 1.0), 0, 0),
+    suppression=Suppression(0.1, 0.2, 250, 250),
+    centers=CenterSpec(
+        (("Car", "Pedestrian", "Cyclist"),),
+        stride=2,
+        limits=(0.0, -39.68, -3.0, 69.12, 39.68, 1.0),
+        max_per_task=100,
+        max_candidates=250,
+        velocity=False,
+    ),
+    encoding="statistics",
+)
+
 PRESETS: dict[str, LidarConfig] = {
     config.name: config
     for config in (

@@ -1,0 +1,98 @@
+"""``lcf3d train lidar``: the small LiDAR detector, on simulated scans, a KITTI folder or nuScenes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from lcf3d.errors import ConfigError
+
+if TYPE_CHECKING:
+    from lcf3d.training.lidar_scans import ScanSource
+
+VALIDATED = 24
+"""Held-out scans that are looked at after each checkpoint; all of them at the end."""
+
+
+def lidar(
+    dataset: Annotated[
+        str, typer.Argument(help="kitti:ROOT or nuscenes:ROOT with scans and labels; simulated scans if left out")
+    ] = "",
+    out: Annotated[Path, typer.Option(help="folder for checkpoints and the finished lidar.onnx")] = Path("train-lidar"),
+    split: Annotated[
+        str | None, typer.Option(help="file of ROOT/ImageSets, or nuScenes split; all if left out")
+    ] = None,
+    version: Annotated[str | None, typer.Option(help="folder of nuScenes tables; the only one if left out")] = None,
+    preset: Annotated[str, typer.Option(help="sensor that is simulated")] = "kitti64",
+    frames: Annotated[int, typer.Option(min=2, help="simulated scans")] = 800,
+    samples_seed: Annotated[int, typer.Option(min=0, help="of the simulated scans")] = 1001,
+    samples: Annotated[Path | None, typer.Option(help="folder of simulated scans; default: the user's cache")] = None,
+    jobs: Annotated[int, typer.Option(min=1, help="processes that simulate")] = 1,
+    held_out: Annotated[int, typer.Option(min=1, help="scans at the end to measure with")] = 100,
+    steps: Annotated[int, typer.Option(min=1)] = 4000,
+    batch_size: Annotated[int, typer.Option(min=1, help="windows a step, 36 m x 38 m each, two of a scan")] = 4,
+    learning_rate: Annotated[float, typer.Option(help="highest one of the schedule")] = 3e-3,
+    seed: Annotated[int, typer.Option(min=0, help="of weights and batches")] = 0,
+    checkpoint_every: Annotated[int, typer.Option(min=1, help="steps between checkpoints and validations")] = 500,
+    workers: Annotated[int, typer.Option(min=0, help="processes that prepare batches")] = 0,
+    threads: Annotated[int, typer.Option(min=0, help="threads of torch; 0 leaves it to torch")] = 0,
+    resume: Annotated[bool, typer.Option("--resume", help="go on from the folder's last checkpoint")] = False,
+) -> None:
+    """Train the small LiDAR detector (Car, Pedestrian, Cyclist) and write it as lidar.onnx.
+
+    Examples:
+
+    lcf3d train lidar --out train-lidar
+
+    lcf3d train lidar kitti:KITTI --split train --steps 20000 --out train-lidar-kitti
+    """
+    from lcf3d.cli.train_common import train_with_progress
+    from lcf3d.detectors.lidar.export import export_onnx
+    from lcf3d.detectors.lidar.presets import COMPACT_KITTI
+    from lcf3d.formats.files import write_json
+    from lcf3d.training.lidar import LidarTask, objects_of, trained_detector
+    from lcf3d.training.loop import TrainingSettings, import_torch
+
+    torch = import_torch()
+    if threads:
+        torch.set_num_threads(threads)
+    scans = _scans(dataset, split, version, preset, frames, samples_seed, samples, jobs)
+    if scans.count <= held_out:
+        raise ConfigError(f"there are {scans.count} scans, too few to hold out {held_out}; lower --held-out")
+    last = scans.count - held_out
+    learned, measured = scans.part(0, last), scans.part(last, scans.count)
+    objects = objects_of(learned, COMPACT_KITTI)
+    task = LidarTask(learned, measured.part(0, VALIDATED), batch_size=batch_size, objects=objects)
+    settings = TrainingSettings(
+        steps, learning_rate, seed=seed, average=0.998, checkpoint_every=checkpoint_every, workers=workers
+    )
+    network = train_with_progress(task, settings, out, resume)
+    export_onnx(trained_detector(network, COMPACT_KITTI), out / "lidar.onnx")
+    figures = LidarTask(learned, measured).validate(network)
+    write_json(out / "figures.json", figures)
+    for name, value in figures.items():
+        typer.echo(f"{name:<20}{value:>9.3f}")
+
+
+def _scans(
+    dataset: str,
+    split: str | None,
+    version: str | None,
+    preset: str,
+    frames: int,
+    samples_seed: int,
+    samples: Path | None,
+    jobs: int,
+) -> ScanSource:
+    from lcf3d.structures import KITTI_CLASSES
+    from lcf3d.training.lidar_scans import dataset_scans, simulated_scans
+
+    if dataset:
+        return dataset_scans(dataset, split, KITTI_CLASSES, version)
+    from lcf3d.cli.train_common import default_samples_root, prepare_samples
+    from lcf3d.training.samples import SampleRecipe
+
+    recipe = SampleRecipe("lidar", preset, frames, samples_seed)
+    return simulated_scans(prepare_samples(recipe, samples or default_samples_root(), jobs), KITTI_CLASSES)

@@ -1,0 +1,141 @@
+"""Labelled scans to train a LiDAR detector on: from simulated samples or from a dataset, in the classes it learns."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lcf3d.datasets.opening import parse_dataset
+from lcf3d.detectors.classes import class_mapping
+from lcf3d.errors import ConfigError, DatasetError
+from lcf3d.geometry.boxes import points_in_boxes
+from lcf3d.geometry.camera import project_points
+from lcf3d.structures import KITTI_CLASSES, Detections3D, FloatArray, Frame, IntArray
+from lcf3d.training.samples import ScanSample, read_scan
+
+BACKGROUND, IGNORED = -1, -2
+LABELLED_KITTI = (*KITTI_CLASSES, "Van", "Truck", "Tram", "Misc", "Person_sitting")
+SEATED = "Person_sitting"
+"""KITTI's class that is neither pedestrian nor background."""
+LEAST_POINTS = 5
+"""Objects with fewer returns are neither to be found nor to be left out."""
+FRONT_TURN = math.pi / 4
+
+
+@dataclass(frozen=True, eq=False)
+class LabelledScan:
+    """A scan and what a detector is to find in it.
+
+    Attributes:
+        points: (N, 4) float32 x, y, z, intensity, LiDAR frame; finite.
+        boxes: (A, 7) LiDAR frame.
+        labels: (A,) class, or `IGNORED` for objects that are neither to be found nor background.
+        counts: (A,) returns in each box.
+    """
+
+    points: NDArray[np.float32]
+    boxes: FloatArray
+    labels: IntArray
+    counts: IntArray
+
+
+@dataclass(frozen=True)
+class ScanSource:
+    """Where labelled scans come from.
+
+    Attributes:
+        read: gives a scan by its number.
+        count: number of scans.
+        turn: largest angle in radians by which a scan may be turned: pi where there are boxes all around.
+    """
+
+    read: Callable[[int], LabelledScan]
+    count: int
+    turn: float
+
+    def __post_init__(self) -> None:
+        if self.count < 1:
+            raise ConfigError("there is no scan to train on; name a split that has some, or simulate more samples")
+
+    def part(self, first: int, last: int) -> ScanSource:
+        """The scans from ``first`` up to and without ``last``."""
+        return ScanSource(lambda i: self.read(first + i), min(last, self.count) - first, self.turn)
+
+
+def simulated_scans(paths: Sequence[Path], class_names: Sequence[str]) -> ScanSource:
+    """Scans of `lcf3d.training.samples`, which have boxes all around."""
+    return ScanSource(lambda i: labelled_scan(read_scan(paths[i]), class_names), len(paths), math.pi)
+
+
+def dataset_scans(
+    dataset: str, split: str | None, class_names: Sequence[str], version: str | None = None
+) -> ScanSource:
+    """Scans of ``kitti:ROOT`` or ``nuscenes:ROOT``.
+
+    KITTI labels only what the left camera sees: points outside its image are left out, and scans are turned by an
+    eighth of a circle at most.
+
+    Raises:
+        DatasetError: the dataset or the split does not exist.
+        ConfigError: the kind of dataset is unknown.
+    """
+    kind, root = parse_dataset(dataset)
+    if kind == "kitti":
+        from lcf3d.datasets.kitti import KittiDataset
+
+        kitti = KittiDataset(root, split, class_names=LABELLED_KITTI)
+        return ScanSource(partial(_from_kitti, kitti, tuple(class_names)), len(kitti), FRONT_TURN)
+    from lcf3d.datasets.nuscenes import NuscenesDataset
+
+    nuscenes = NuscenesDataset(root, version, split)
+    return ScanSource(lambda i: _from_frame(nuscenes[i], class_names), len(nuscenes), math.pi)
+
+
+def labelled_scan(sample: ScanSample, class_names: Sequence[str]) -> LabelledScan:
+    """The scan of a sample with labels of ``class_names``; objects of other classes are background.
+
+    Vans are cars. Seated persons, and objects with fewer than `LEAST_POINTS` returns, are ignored.
+    """
+    mapping = class_mapping(tuple(sorted({*sample.names.tolist()})), class_names)
+    index = {name: i for i, name in enumerate(class_names)}
+    labels = np.full(len(sample.names), BACKGROUND, np.int64)
+    for i, name in enumerate(sample.names.tolist()):
+        labels[i] = IGNORED if name == SEATED else index.get(mapping.get(name, ""), BACKGROUND)
+    kept = np.isfinite(sample.boxes).all(axis=1) & (sample.boxes[:, 3:6] > 0).all(axis=1) & (labels != BACKGROUND)
+    labels = np.where(sample.points_on < LEAST_POINTS, IGNORED, labels)[kept]
+    points = sample.points[np.isfinite(sample.points).all(axis=1)] if len(sample.points) else sample.points
+    return LabelledScan(points, sample.boxes[kept], labels, sample.points_on[kept].astype(np.int64))
+
+
+def _from_kitti(kitti: Sequence[Frame], class_names: tuple[str, ...], index: int) -> LabelledScan:
+    frame = kitti[index]
+    camera = frame.camera("left")
+    points = _points(frame)
+    pixels, _ = project_points(points, camera)
+    # comparisons with NaN, the pixel of a point behind the camera, are false
+    seen = ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=1)
+    return _labelled(points[seen], frame.labels, class_names)
+
+
+def _from_frame(frame: Frame, class_names: Sequence[str]) -> LabelledScan:
+    return _labelled(_points(frame), frame.labels, class_names)
+
+
+def _points(frame: Frame) -> NDArray[np.float32]:
+    if frame.points is None or frame.labels is None:
+        missing = "scan" if frame.points is None else "labels"
+        raise DatasetError(f"frame {frame.id} has no {missing}; train on frames that have scan and labels")
+    return np.ascontiguousarray(frame.points[:, :4], dtype=np.float32)
+
+
+def _labelled(points: NDArray[np.float32], labels: Detections3D | None, class_names: Sequence[str]) -> LabelledScan:
+    found = Detections3D.empty(class_names) if labels is None else labels
+    names = np.array(found.class_names, dtype=np.str_)[found.labels]
+    counts = points_in_boxes(points, found.boxes).sum(axis=1).astype(np.int64)
+    return labelled_scan(ScanSample(points, found.boxes, names, counts), class_names)
