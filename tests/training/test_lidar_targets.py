@@ -30,7 +30,14 @@ def maps_of(targets):
     flat[:, targets.cells] = targets.boxes[:, :-1].T
     values = flat.reshape(-1, height, width)
     heat = np.log(np.clip(targets.heat, 1e-6, 1 - 1e-3) / (1 - np.clip(targets.heat, 1e-6, 1 - 1e-3)))
-    return {"reg": values[:2], "height": values[2:3], "dim": values[3:6], "rot": values[6:8], "heatmap": heat}
+    return {
+        "reg": values[:2],
+        "height": values[2:3],
+        "dim": values[3:6],
+        "rot": values[6:8],
+        "axis": values[8:10],
+        "heatmap": heat,
+    }
 
 
 def test_decoding_inverts_the_targets():
@@ -47,6 +54,15 @@ def test_decoding_inverts_the_targets():
     np.testing.assert_allclose(many.boxes, nearest, atol=1e-5)
     kept = detections(*decode_center_maps([maps], CONFIG, 0.4, "keep"), CONFIG)
     assert sorted(kept.labels.tolist()) == [0, 1, 2]
+
+
+def test_the_axis_holds_where_front_and_rear_are_confused():
+    maps = maps_of(center_targets(BOXES, LABELS, CONFIG))
+    maps["rot"] = np.stack([np.sin(0.9 + 0 * maps["rot"][0]), np.cos(0.9 + 0 * maps["rot"][0])])
+    found = detections(*decode_center_maps([maps], CONFIG, 0.9, "off"), CONFIG)
+    turn = found.boxes[np.argsort(found.labels), 6] - BOXES[:, 6]
+    np.testing.assert_allclose(np.abs(np.cos(turn)), 1, atol=1e-6)
+    assert (np.cos(found.boxes[:, 6] - 0.9) >= 0).all()
 
 
 def test_weights_of_an_object_sum_to_one():

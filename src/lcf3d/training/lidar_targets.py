@@ -14,15 +14,18 @@ from numpy.typing import NDArray
 from lcf3d.detectors.lidar.config import LidarConfig
 from lcf3d.structures import FloatArray, IntArray
 
-BOX_CHANNELS = 9
+BOX_CHANNELS = 11
 """Regressed values: offset from the cell's corner along x and y in cells, z of the centre, logs of length, width and
-height, sine and cosine of the yaw, and the weight of the cell (whose sum over the cells of an object is 1)."""
+height, sine and cosine of the yaw and of twice the yaw, and the weight of the cell (whose sum over the cells of an
+object is 1)."""
 AROUND = 1
 """Cells around an object's own, in each direction, that also learn its box: without suppression they give overlapping
 boxes, which the fusion's clustering lives on."""
 HEAT_SIGMA = 0.8
 """Standard deviation in cells of an object's heat, for small objects; long ones have a larger one."""
 HEAT_REACH = 3
+FRONT_WEIGHT = 0.5
+"""Weight of the heading beside that of its axis, on which the overlap with the object depends."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,10 +77,11 @@ def center_targets(boxes: FloatArray, labels: IntArray, config: LidarConfig) -> 
     values[:, 2] = boxes[owners, 2]
     values[:, 3:6] = np.log(boxes[owners, 3:6])
     values[:, 6], values[:, 7] = np.sin(boxes[owners, 6]), np.cos(boxes[owners, 6])
+    values[:, 8], values[:, 9] = np.sin(2 * boxes[owners, 6]), np.cos(2 * boxes[owners, 6])
     off = values[:, :2].astype(np.float64) - 0.5
     near = np.exp(-(off**2).sum(axis=1) / (2 * HEAT_SIGMA**2))
     total = np.bincount(owners, near, minlength=len(boxes))
-    values[:, 8] = near / total[owners]
+    values[:, -1] = near / total[owners]
     return CenterTargets(heat, counted, cells, values)
 
 
@@ -111,7 +115,7 @@ def _blank(counted, x, y, half_length, half_width, yaw):  # type: ignore[no-unty
 
 
 def center_losses(maps: Mapping[str, Any], batch: Mapping[str, Any], box_weight: float) -> dict[str, Any]:
-    """Loss terms ``heat``, ``place``, ``size`` and ``heading`` of a centre head's maps.
+    """Loss terms ``heat``, ``place``, ``size``, ``heading`` and ``axis`` of a centre head's maps.
 
     Args:
         maps: of one task, (N, C, H, W) each.
@@ -129,7 +133,7 @@ def center_losses(maps: Mapping[str, Any], batch: Mapping[str, Any], box_weight:
     missed = wanted * (1 - found) ** 2 * torch.nn.functional.softplus(-logits)
     false = (1 - wanted) * (1 - heat) ** 4 * found**2 * torch.nn.functional.softplus(logits)
     heat_loss = ((missed + false) * batch["counted"][:, None]).sum() / objects
-    flat = torch.cat([maps[name] for name in ("reg", "height", "dim", "rot")], dim=1).float()
+    flat = torch.cat([maps[name] for name in ("reg", "height", "dim", "rot", "axis")], dim=1).float()
     learned = flat.permute(0, 2, 3, 1).reshape(-1, BOX_CHANNELS - 1)[batch["cells"]]
     values, weight = batch["boxes"][:, :-1], batch["boxes"][:, -1:]
     error = (learned - values).abs() * weight * (box_weight / objects)
@@ -137,5 +141,6 @@ def center_losses(maps: Mapping[str, Any], batch: Mapping[str, Any], box_weight:
         "heat": heat_loss,
         "place": error[:, :3].sum(),
         "size": error[:, 3:6].sum(),
-        "heading": error[:, 6:8].sum(),
+        "heading": error[:, 6:8].sum() * FRONT_WEIGHT,
+        "axis": error[:, 8:10].sum(),
     }

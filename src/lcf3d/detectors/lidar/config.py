@@ -80,6 +80,8 @@ class CenterSpec:
         max_per_task: boxes kept of each task after suppression.
         max_candidates: heat-map peaks taken of each task.
         velocity: whether the head predicts velocities.
+        axis: whether it also predicts the doubled heading, which is the same for front and rear: where the network
+            cannot tell which is which, the box still lies along the object.
     """
 
     tasks: tuple[tuple[str, ...], ...]
@@ -88,6 +90,7 @@ class CenterSpec:
     max_per_task: int = 83
     max_candidates: int = 500
     velocity: bool = True
+    axis: bool = False
 
 
 @dataclass(frozen=True)

@@ -166,7 +166,7 @@ def decode_center_maps(
 
     Args:
         tasks: for each task the maps ``heatmap`` (K, H, W), ``reg`` (2), ``height`` (1), ``dim`` (3), ``rot`` (2) and,
-            of networks that predict velocities, ``vel`` (2), all at one resolution.
+            where the configuration says so, ``vel`` (2) and ``axis`` (2), all at one resolution.
         config: a configuration with ``centers``.
         score_threshold: boxes need a higher score.
         nms: the mode of suppression.
@@ -204,6 +204,10 @@ def _center_boxes(maps: Mapping[str, Map], cells: IntArray, config: LidarConfig)
     boxes[:, 3:6] = np.exp(np.minimum(values["dim"], 88.0)).T
     boxes[:, 2] = values["height"][0] - boxes[:, 5] / 2
     boxes[:, 6] = np.arctan2(values["rot"][0], values["rot"][1])
+    if config.centers.axis:
+        along = np.arctan2(values["axis"][0], values["axis"][1]) / 2
+        # of the two headings along the axis, the one that is nearer what the network thinks is the front
+        boxes[:, 6] = along + np.pi * (np.cos(boxes[:, 6] - along) < 0)
     if config.has_velocity:
         boxes[:, 7:] = values["vel"].T
     return boxes

@@ -15,7 +15,8 @@ CENTER_CHANNELS = {"reg": 2, "height": 1, "dim": 3, "rot": 2, "vel": 2}
 
 def center_channels(spec: CenterSpec) -> dict[str, int]:
     """Channels of the box maps of a centre head by name, in order."""
-    return {name: count for name, count in CENTER_CHANNELS.items() if spec.velocity or name != "vel"}
+    channels = {name: count for name, count in CENTER_CHANNELS.items() if spec.velocity or name != "vel"}
+    return {**channels, "axis": 2} if spec.axis else channels
 
 
 class AnchorHead(nn.Module):
@@ -101,19 +102,21 @@ class CenterHead(nn.Module):
 
 
 class LightCenterHead(nn.Module):
-    """A centre head of one convolution and one 1 x 1 convolution a map, for all tasks from the same features."""
+    """A centre head of two convolutions in all: one shared, and a 1 x 1 convolution to all maps of a task."""
 
     def __init__(self, in_channels: int, channels: int, spec: CenterSpec) -> None:
         super().__init__()
         self.shared_conv = ConvModule(in_channels, channels, 3)
-        self.task_heads = nn.ModuleList()
-        for task in spec.tasks:
-            maps = {**center_channels(spec), "heatmap": len(task)}
-            self.task_heads.append(nn.ModuleDict({name: nn.Conv2d(channels, n, 1) for name, n in maps.items()}))
+        self.maps = [{**center_channels(spec), "heatmap": len(task)} for task in spec.tasks]
+        self.task_heads = nn.ModuleList([nn.Conv2d(channels, sum(maps.values()), 1) for maps in self.maps])
+        for maps, head in zip(self.maps, self.task_heads, strict=True):
             # a scan is almost empty: start from a probability that says so
-            nn.init.constant_(self.task_heads[-1]["heatmap"].bias, -4.0)
+            nn.init.constant_(head.bias[-maps["heatmap"] :], -4.0)
 
     def forward(self, maps: Sequence[Tensor]) -> list[dict[str, Tensor]]:
         """The maps of every task."""
         shared = self.shared_conv(maps[0])
-        return [{name: conv(shared) for name, conv in head.items()} for head in self.task_heads]
+        return [
+            dict(zip(names, head(shared).split(list(names.values()), dim=1), strict=True))
+            for names, head in zip(self.maps, self.task_heads, strict=True)
+        ]

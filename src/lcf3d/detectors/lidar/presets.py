@@ -203,6 +203,7 @@ COMPACT_KITTI = LidarConfig(
         max_per_task=100,
         max_candidates=250,
         velocity=False,
+        axis=True,
     ),
     encoding="statistics",
 )
