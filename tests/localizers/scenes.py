@@ -71,3 +71,9 @@ def turned_scene(points, boxes, yaw):
     turned = points.copy()
     turned[:, :3] = points[:, :3] @ turn(yaw)[:3, :3].T
     return turned, transform_boxes(np.array(boxes), turn(yaw))
+
+
+def street_proposals(**options):
+    """A car, a pedestrian and a cyclist ahead, as proposals."""
+    boxes = [standing(15, 2, 4, 1.6, 1.5, 0.3), standing(9, -2.5, 0.8, 0.6, 1.75, 0), standing(12, 6, 1.8, 0.6, 1.7, 1)]
+    return propose(scan(boxes), boxes, [0, 1, 2], **options)

@@ -24,6 +24,8 @@ VERBS: dict[str, str] = {
     "ablate": "ablate",
     "generalize": "generalize",
 }
+# verbs with verbs of their own: module of lcf3d.cli that defines a typer app of that name
+GROUPS: dict[str, str] = {"train": "train"}
 
 app = typer.Typer(
     name="lcf3d",
@@ -35,6 +37,8 @@ app = typer.Typer(
 
 for verb, module in VERBS.items():
     app.command(verb)(getattr(import_module(f"lcf3d.cli.{module}"), verb))
+for group, module in GROUPS.items():
+    app.add_typer(getattr(import_module(f"lcf3d.cli.{module}"), group))
 
 
 def main() -> None:

@@ -33,6 +33,9 @@ def run(
     ] = None,
     set_: Annotated[list[str] | None, typer.Option("--set", help="change a setting, name=value; repeatable")] = None,
     recovery: Annotated[str | None, typer.Option(help="on or off; off needs no scans")] = None,
+    localizer: Annotated[
+        str, typer.Option(help="hybrid, geometric, network, onnx:FILE or frustum-pointnet:CHECKPOINT")
+    ] = "hybrid",
     tiles: Annotated[int, typer.Option(min=1, help="overlapping tiles across wide images, for onnx: detectors")] = 1,
     calibration: Annotated[
         str, typer.Option(help="score calibration: a file of 'lcf3d calibrate', auto, or none")
@@ -69,6 +72,7 @@ def run(
         config=config,
         changes=tuple(set_ or ()),
         recovery=recovery,
+        localizer=localizer,
         tiles=tiles,
         calibration=calibration,
         missing=missing,

@@ -24,6 +24,8 @@ from lcf3d.fusion.config import FusionConfig
 from lcf3d.fusion.pipeline import LateCascadeFusion
 from lcf3d.fusion.self_calibration import self_calibrate
 from lcf3d.fusion.stereo import StereoConfig, StereoLateCascadeFusion
+from lcf3d.localizers.base import Localizer
+from lcf3d.localizers.named import load_localizer
 from lcf3d.runner import FrameRunner
 
 Dataset = KittiDataset | NuscenesDataset
@@ -49,19 +51,21 @@ class RunRequest:
     config: str | None = None
     changes: tuple[str, ...] = ()
     recovery: str | None = None
+    localizer: str = "hybrid"
     tiles: int = 1
     calibration: str = "auto"
     missing: str = "error"
 
 
 class Inputs(NamedTuple):
-    """What a run reads: dataset, frames, settings, the LiDAR branch and the branch of each camera."""
+    """What a run reads: dataset, frames, settings, the LiDAR branch, the branch of each camera, the localizer."""
 
     dataset: Dataset
     frame_ids: tuple[str, ...]
     config: FusionConfig
     lidar: LidarSource
     cameras: dict[str, CameraSource]
+    localizer: Localizer
 
 
 @dataclass(frozen=True)
@@ -81,9 +85,9 @@ def prepare_run(request: RunRequest, out: Path, *, resume: bool, overwrite: bool
     Raises:
         Lcf3dError: anything wrong with the request, the dataset or the result files.
     """
-    dataset, frame_ids, config, lidar, cameras = read_inputs(request)
+    dataset, frame_ids, config, lidar, cameras, localizer = read_inputs(request)
     folder = KittiRunFolder(out) if isinstance(dataset, KittiDataset) else NuscenesRunFolder(out, dataset)
-    runner = FrameRunner(dataset, lidar, cameras, _fusion(config, None), folder)
+    runner = FrameRunner(dataset, lidar, cameras, _fusion(config, localizer, None), folder)
     from lcf3d import __version__
 
     # checked before anything is written; with results in files this is quick
@@ -95,7 +99,7 @@ def prepare_run(request: RunRequest, out: Path, *, resume: bool, overwrite: bool
     folder.begin(config, _as_json(written), resume=resume, overwrite=overwrite)
     if calibration is not None:
         calibration.dump(folder.calibration_path)
-        runner.fusion = _fusion(config, calibration)
+        runner.fusion = _fusion(config, localizer, calibration)
     return Run(dataset, frame_ids, config, runner, folder)
 
 
@@ -115,7 +119,7 @@ def read_inputs(request: RunRequest) -> Inputs:
         if isinstance(source, KittiResults):
             source.load(frame_ids)
     _require_images(dataset, frame_ids, cameras)
-    return Inputs(dataset, frame_ids, config, lidar, cameras)
+    return Inputs(dataset, frame_ids, config, lidar, cameras, load_localizer(request.localizer))
 
 
 def _as_json(value: dict[str, Any]) -> dict[str, Any]:
@@ -193,10 +197,10 @@ def _require_images(dataset: Dataset, frame_ids: Sequence[str], cameras: dict[st
             )
 
 
-def _fusion(config: FusionConfig, calibration: Calibration | None) -> LateCascadeFusion:
+def _fusion(config: FusionConfig, localizer: Localizer, calibration: Calibration | None) -> LateCascadeFusion:
     if isinstance(config, StereoConfig):
-        return StereoLateCascadeFusion(config, calibration=calibration)
-    return LateCascadeFusion(config, calibration=calibration)
+        return StereoLateCascadeFusion(config, localizer, calibration=calibration)
+    return LateCascadeFusion(config, localizer, calibration=calibration)
 
 
 def _calibration(

@@ -35,6 +35,7 @@ ENTRY_POINT_GROUP = "lcf3d.detectors"
 # kind -> "module:callable", imported when the kind is first used
 KINDS: dict[Sensor, dict[str, str]] = {
     "camera": {
+        "shipped": "lcf3d.detectors.camera.small:shipped",
         "onnx": "lcf3d.detectors.camera.onnx:OnnxDetector",
         "results": "lcf3d.detectors.results:CameraResults",
         "fasterrcnn": "lcf3d.detectors.camera.torchvision_fasterrcnn:TorchvisionFasterRCNN",
@@ -42,6 +43,7 @@ KINDS: dict[Sensor, dict[str, str]] = {
         "mmdet": "lcf3d.detectors.camera.mmdet:MmdetDetector",
     },
     "lidar": {
+        "shipped": "lcf3d.detectors.lidar.kinds:shipped",
         "results": "lcf3d.detectors.results:LidarResults",
         "onnx-lidar": "lcf3d.detectors.lidar.kinds:onnx_lidar",
         "pointpillars": "lcf3d.detectors.lidar.kinds:pointpillars",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -77,6 +77,25 @@ class FrustumProposals:
     def part(self, k: int) -> slice:
         """Where proposal ``k``'s points lie in ``points``, ``gaussian`` and ``mask``."""
         return slice(int(self.offsets[k]), int(self.offsets[k + 1]))
+
+    def select(self, chosen: IntArray) -> FrustumProposals:
+        """The proposals of those indices, in that order."""
+        index = np.concatenate([np.arange(self.offsets[k], self.offsets[k + 1]) for k in chosen] or [chosen[:0]])
+        second = None if self.second is None else SecondViews(*(part[chosen] for part in self.second))
+        return replace(
+            self,
+            points=self.points[index],
+            gaussian=self.gaussian[index],
+            mask=None if self.mask is None else self.mask[index],
+            offsets=np.cumsum([0, *np.diff(self.offsets)[chosen]]).astype(np.int64),
+            axis_yaw=self.axis_yaw[chosen],
+            boxes2d=self.boxes2d[chosen],
+            scores=self.scores[chosen],
+            labels=self.labels[chosen],
+            camera_index=self.camera_index[chosen],
+            detection_index=self.detection_index[chosen],
+            second=second,
+        )
 
     def lidar_from_frustum(self, boxes: FloatArray) -> FloatArray:
         """(K, 7) boxes, one a proposal in its frustum frame, turned back into the LiDAR frame."""

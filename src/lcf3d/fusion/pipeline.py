@@ -31,7 +31,7 @@ class LateCascadeFusion:
 
     Args:
         config: settings; the defaults of `FusionConfig` if not given.
-        localizer: puts boxes into frustums; the geometric one, which needs no weights, if not given.
+        localizer: puts boxes into frustums; `lcf3d.localizers.named.default_localizer` if not given.
         calibration: what the detectors' scores mean, see `lcf3d.fusion.calibration`; scores are taken as they are if
             not given, and must then lie in [0, 1].
 
@@ -50,9 +50,9 @@ class LateCascadeFusion:
         self.config = config or FusionConfig()
         self.calibration = calibration or Calibration()
         if localizer is None:
-            from lcf3d.localizers.geometric import GeometricLocalizer
+            from lcf3d.localizers.named import default_localizer
 
-            localizer = GeometricLocalizer()
+            localizer = default_localizer()
         self.localizer = localizer
 
     def __call__(self, frame: Frame, lidar: Detections3D, camera: Mapping[str, Detections2D]) -> FusedDetections:

@@ -14,7 +14,8 @@ from dataclasses import asdict, dataclass
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
+from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,8 +60,12 @@ class SampleRecipe:
 
     @property
     def folder(self) -> str:
-        """A folder name that tells such sets apart."""
-        return f"{self.preset}-{self.sensor}-{self.frames}-seed{self.seed}"
+        """A folder name that tells such sets apart; a longer set begins with the shorter one."""
+        return f"{self.preset}-{self.sensor}-seed{self.seed}"
+
+    def made_by(self) -> dict[str, Any]:
+        """What every single sample depends on."""
+        return {name: value for name, value in asdict(self).items() if name != "frames"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +124,7 @@ def write_samples(
         MissingExtraError: embreex is not installed and something is missing.
     """
     settings = root / RECIPE_FILE
-    if settings.is_file() and read_json(settings) != asdict(recipe):
+    if settings.is_file() and read_json(settings) != recipe.made_by():
         raise ConfigError(f"{root} holds samples of another recipe; name another folder, or remove it")
     paths = [root / f"{index:06d}.npz" for index in range(recipe.frames)]
     missing = [index for index, path in enumerate(paths) if not path.is_file()]
@@ -128,7 +133,7 @@ def write_samples(
         return paths
     if find_spec("embreex") is None:
         raise MissingExtraError("embreex", "simulate", "simulating training samples")
-    write_json(settings, asdict(recipe))
+    write_json(settings, recipe.made_by())
     work = partial(_write_one, recipe, root)
     if jobs == 1:
         _count(map(work, missing), progress)
@@ -224,9 +229,9 @@ def read_image(path: Path) -> ImageSample:
     return ImageSample(*_read(path, ("image", "boxes", "visible", "names", "hidden", "truncated", "owner")))
 
 
-def _read(path: Path, names: tuple[str, ...]) -> list[NDArray[np.generic]]:
+def _read(path: Path, names: tuple[str, ...]) -> list[NDArray[Any]]:
     try:
         with np.load(path, allow_pickle=False) as arrays:
             return [arrays[name] for name in names]
-    except (OSError, ValueError, KeyError, EOFError) as error:
+    except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
         raise FormatError(f"{path} is no training sample ({error}); remove it to have it simulated again") from error

@@ -1,0 +1,15 @@
+"""``lcf3d train``: the small networks, each with one command from the simulation to an ONNX file."""
+
+from __future__ import annotations
+
+import typer
+
+from lcf3d.cli.train_localizer import localizer
+
+train = typer.Typer(
+    name="train",
+    help="Train the small networks: localizer, LiDAR detector, camera detector (needs pip install 'lcf3d[train]').",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+)
+train.command("localizer")(localizer)

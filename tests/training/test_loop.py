@@ -1,0 +1,107 @@
+import json
+
+import numpy as np
+import pytest
+
+from lcf3d.errors import ConfigError, DetectorError
+
+torch = pytest.importorskip("torch")
+
+from lcf3d.training.loop import LAST, TrainingSettings, train  # noqa: E402
+
+
+class Line:
+    """y = 2 x - 1 by a small network with dropout and batch normalization."""
+
+    def __init__(self, hidden=8, spoilt_step=None):
+        self.hidden, self.spoilt_step = hidden, spoilt_step
+
+    def network(self):
+        return torch.nn.Sequential(
+            torch.nn.Linear(1, self.hidden), torch.nn.BatchNorm1d(self.hidden), torch.nn.Dropout(0.1),
+            torch.nn.ReLU(), torch.nn.Linear(self.hidden, 1),
+        )  # fmt: skip
+
+    def batch(self, step, rng):
+        x = rng.normal(size=(16, 1)).astype(np.float32)
+        if step == self.spoilt_step:
+            x[0] = np.nan
+        return {"x": torch.from_numpy(x), "y": torch.from_numpy(2 * x - 1)}
+
+    def loss(self, network, batch):
+        return {"square": ((network(batch["x"]) - batch["y"]) ** 2).mean()}
+
+    def validate(self, network):
+        return {"at one": float(network(torch.ones(1, 1)))}
+
+
+SETTINGS = TrainingSettings(40, 0.05, average=0.9, checkpoint_every=10)
+
+
+class Stop(Exception):
+    pass
+
+
+def stop_at(step):
+    def report(progress):
+        if progress.step == step:
+            raise Stop
+
+    return report
+
+
+def same(a, b):
+    return all(torch.equal(x, y) for x, y in zip(a.state_dict().values(), b.state_dict().values(), strict=True))
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_interrupted_at_any_moment_and_resumed_is_as_if_nothing_had_happened(tmp_path, workers):
+    settings = TrainingSettings(**{**vars(SETTINGS), "workers": workers})
+    whole = train(Line(), settings, tmp_path / "whole")
+    for step in (3, 17, 20, 39):
+        with pytest.raises(Stop):
+            train(Line(), settings, tmp_path / f"{step}", report=stop_at(step))
+        assert same(whole, train(Line(), settings, tmp_path / f"{step}", resume=True))
+    history = json.loads((tmp_path / "17" / "metrics.json").read_text())
+    assert [entry["step"] for entry in history] == [10, 20, 30, 40]
+    assert same(whole, train(Line(), settings, tmp_path / "whole", resume=True)), "nothing is left to do"
+
+
+def test_it_learns_and_reports(tmp_path):
+    reports = []
+    train(Line(), TrainingSettings(200, 0.05, average=0.9, checkpoint_every=50), tmp_path, report=reports.append)
+    assert reports[-1].validation["at one"] == pytest.approx(1, abs=0.4)
+    assert np.mean([r.loss for r in reports[-20:]]) < 0.3 * np.mean([r.loss for r in reports[:20]])
+    assert any((tmp_path / "tensorboard").iterdir())
+
+
+def test_a_loss_that_is_not_finite_stops_with_the_last_good_checkpoint(tmp_path):
+    with pytest.raises(DetectorError, match=r"'square' of step 25 is not finite; .*last\.pt is the last good"):
+        train(Line(spoilt_step=25), SETTINGS, tmp_path)
+    assert torch.load(tmp_path / LAST, weights_only=True)["step"] == 20
+    with pytest.raises(DetectorError, match="no checkpoint yet"):
+        train(Line(spoilt_step=5), SETTINGS, tmp_path / "early")
+
+
+def test_a_folder_in_use_other_settings_and_other_networks_are_refused(tmp_path):
+    train(Line(), SETTINGS, tmp_path)
+    with pytest.raises(ConfigError, match="holds a training already"):
+        train(Line(), SETTINGS, tmp_path)
+    with pytest.raises(ConfigError, match="trained with other settings"):
+        train(Line(), TrainingSettings(41, 0.05, average=0.9, checkpoint_every=10), tmp_path, resume=True)
+    with pytest.raises(DetectorError, match=r"another architecture: '0\.weight' has shape \(8, 1\), expected \(9, 1\)"):
+        train(Line(hidden=9), SETTINGS, tmp_path, resume=True)
+    (tmp_path / LAST).write_bytes(b"torn")
+    with pytest.raises(DetectorError, match="damaged"):
+        train(Line(), SETTINGS, tmp_path, resume=True)
+
+
+def test_the_rate_rises_and_falls():
+    settings = TrainingSettings(100, 1.0, warmup=0.1)
+    assert settings.rate(0) == pytest.approx(0.1)
+    assert settings.rate(10) == pytest.approx(1.0)
+    assert settings.rate(55) == pytest.approx(0.5)
+    assert settings.rate(99) < 0.01
+    for bad in ({"steps": 0}, {"learning_rate": 0.0}):
+        with pytest.raises(ConfigError):
+            TrainingSettings(**{"steps": 10, **bad})
