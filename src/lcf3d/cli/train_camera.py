@@ -1,0 +1,101 @@
+"""``lcf3d train camera``: the small camera detector, on simulated images or a KITTI folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from lcf3d.errors import ConfigError
+
+if TYPE_CHECKING:
+    from lcf3d.training.camera_images import LabelledImage
+
+# of KITTI's resolution, at which the detector looks at its images
+SAMPLE_SCALE = 0.67
+
+
+def camera(
+    dataset: Annotated[
+        str, typer.Argument(help="kitti:ROOT with images and labels; simulated images if left out")
+    ] = "",
+    out: Annotated[Path, typer.Option(help="folder for checkpoints and the finished camera.onnx")] = Path(
+        "train-camera"
+    ),
+    split: Annotated[str, typer.Option(help="file of ROOT/ImageSets")] = "train",
+    masks: Annotated[bool, typer.Option(help="learn instance masks; a KITTI folder has none")] = True,
+    frames: Annotated[int, typer.Option(min=2, help="simulated images")] = 700,
+    samples_seed: Annotated[int, typer.Option(min=0, help="of the simulated images")] = 1002,
+    samples: Annotated[Path | None, typer.Option(help="folder of simulated images; default: the user's cache")] = None,
+    jobs: Annotated[int, typer.Option(min=1, help="processes that simulate")] = 1,
+    held_out: Annotated[int, typer.Option(min=1, help="images at the end to measure and calibrate with")] = 100,
+    steps: Annotated[int, typer.Option(min=1)] = 3600,
+    batch_size: Annotated[int, typer.Option(min=1, help="views a step, 192 x 416 pixels each")] = 8,
+    learning_rate: Annotated[float, typer.Option(help="highest one of the schedule")] = 3e-3,
+    seed: Annotated[int, typer.Option(min=0, help="of weights and batches")] = 0,
+    checkpoint_every: Annotated[int, typer.Option(min=1, help="steps between checkpoints and validations")] = 600,
+    workers: Annotated[int, typer.Option(min=0, help="processes that prepare batches")] = 0,
+    threads: Annotated[int, typer.Option(min=0, help="threads of torch; 0 leaves it to torch")] = 0,
+    resume: Annotated[bool, typer.Option("--resume", help="go on from the folder's last checkpoint")] = False,
+) -> None:
+    """Train the small camera detector (Car, Pedestrian, Cyclist) and write it as camera.onnx.
+
+    Examples:
+
+    lcf3d train camera --out train-camera
+
+    lcf3d train camera kitti:KITTI --split train --no-masks --out train-camera-kitti
+    """
+    from lcf3d.cli.train_common import train_with_progress
+    from lcf3d.detectors.camera.small_export import export_small
+    from lcf3d.detectors.camera.small_network import SmallConfig
+    from lcf3d.formats.files import write_json
+    from lcf3d.training.camera import CameraTask
+    from lcf3d.training.camera_calibration import calibrate
+    from lcf3d.training.loop import TrainingSettings, import_torch
+
+    torch = import_torch()
+    if threads:
+        torch.set_num_threads(threads)
+    if dataset:
+        if masks:
+            raise ConfigError(f"{dataset} has no instance masks to learn from; add --no-masks")
+        images = _kitti_images(dataset, split)
+    else:
+        images = _simulated_images(frames, samples_seed, samples, jobs, masks)
+    if len(images) <= held_out:
+        raise ConfigError(f"there are {len(images)} images, too few to hold out {held_out}; lower --held-out")
+    config = SmallConfig() if masks else SmallConfig(prototypes=0)
+    task = CameraTask(images[:-held_out], images[-held_out:], config, batch_size)
+    settings = TrainingSettings(
+        steps, learning_rate, seed=seed, average=0.998, checkpoint_every=checkpoint_every, workers=workers
+    )
+    network = train_with_progress(task, settings, out, resume)
+    calibrate(network, task.held_out)
+    export_small(network, out / "camera.onnx")
+    figures = task.validate(network)
+    write_json(out / "figures.json", figures)
+    for name, value in figures.items():
+        typer.echo(f"{name:<20}{value:>9}")
+    typer.echo(f"detector: {out / 'camera.onnx'} (use it as onnx:{out / 'camera.onnx'})")
+
+
+def _simulated_images(frames: int, seed: int, root: Path | None, jobs: int, masks: bool) -> list[LabelledImage]:
+    from lcf3d.cli.train_common import default_samples_root, prepare_samples
+    from lcf3d.training.camera_images import read_samples
+    from lcf3d.training.samples import SampleRecipe
+
+    recipe = SampleRecipe("camera", "kitti64", frames, seed, SAMPLE_SCALE)
+    return read_samples(prepare_samples(recipe, default_samples_root() if root is None else root, jobs), masks)
+
+
+def _kitti_images(dataset: str, split: str) -> list[LabelledImage]:
+    from lcf3d.datasets.opening import parse_dataset
+    from lcf3d.training.camera import INPUT_SIZE
+    from lcf3d.training.camera_images import read_kitti
+
+    kind, root = parse_dataset(dataset)
+    if kind != "kitti":
+        raise ConfigError(f"lcf3d train camera reads kitti:ROOT or simulates its images, got {dataset!r}")
+    return read_kitti(root, split, INPUT_SIZE)

@@ -1,0 +1,123 @@
+"""Training of the small camera detector: its batches, its loss and its measure, for `lcf3d.training.loop.train`."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from lcf3d.errors import ConfigError
+from lcf3d.structures import IntArray
+from lcf3d.training.camera_augmentation import Augmentation, draw_view
+from lcf3d.training.camera_evaluation import evaluate_detector
+from lcf3d.training.camera_images import LabelledImage
+from lcf3d.training.loop import import_torch
+
+if TYPE_CHECKING:
+    from lcf3d.detectors.camera.small_network import SmallConfig, SmallDetector
+
+INPUT_SIZE = (256, 832)
+"""(height, width) of the network's input: KITTI's proportions at two thirds of its resolution."""
+COARSEST = 32
+
+
+@dataclass(frozen=True)
+class CameraTask:
+    """What the camera detector learns from.
+
+    Attributes:
+        images: to learn from.
+        held_out: to measure with; may be empty.
+        config: size of the network; its classes are KITTI's three.
+        batch_size: views a step.
+        view: (height, width) of the views, multiples of 32.
+        augmentation: how views are drawn.
+    """
+
+    images: Sequence[LabelledImage]
+    held_out: Sequence[LabelledImage]
+    config: SmallConfig
+    batch_size: int = 8
+    view: tuple[int, int] = (192, 416)
+    augmentation: Augmentation = field(default_factory=Augmentation)
+
+    def __post_init__(self) -> None:
+        if not self.images:
+            raise ConfigError("the camera detector needs at least one image to learn from, got none")
+        if self.batch_size < 1 or any(side < COARSEST or side % COARSEST for side in self.view):
+            raise ConfigError(
+                f"batch_size must be 1 or more and views multiples of {COARSEST} pixels, "
+                f"got {self.batch_size} and {self.view[0]} x {self.view[1]}"
+            )
+        if self.config.prototypes and any(image.owner is None for image in self.images):
+            raise ConfigError("these images have no instance masks to learn from; train with --no-masks")
+
+    def network(self) -> SmallDetector:
+        """A detector with random weights."""
+        from lcf3d.detectors.camera.small_network import SmallDetector
+
+        network: SmallDetector = SmallDetector(self.config).to(memory_format=import_torch().channels_last)
+        return network
+
+    def batch(self, step: int, rng: np.random.Generator) -> dict[str, Any]:
+        """Views of random images: uint8 pixels and the objects of all views one after the other."""
+        torch = import_torch()
+        chosen = [self._draw(rng) for _ in range(self.batch_size)]
+        views = [draw_view(self.images[i], self.view, self.augmentation, rng) for i in chosen]
+        counts = [len(view.labels) for view in views]
+        batch = {
+            "pixels": np.stack([view.image for view in views]).transpose(0, 3, 1, 2),
+            "image": np.repeat(np.arange(len(views)), counts),
+            "boxes": np.concatenate([view.boxes for view in views]).astype(np.float32),
+            "visible": np.concatenate([view.visible for view in views]).astype(np.float32),
+            "labels": np.concatenate([view.labels for view in views]),
+            "numbers": np.concatenate([view.numbers for view in views]),
+        }
+        if self.config.prototypes:
+            batch["owner"] = np.stack([view.owner for view in views if view.owner is not None])
+        # the strides of transposed pixels are those of torch's channels_last
+        return {name: torch.from_numpy(value) for name, value in batch.items()}
+
+    @cached_property
+    def _rare(self) -> IntArray:
+        """Images with pedestrians or cyclists."""
+        return np.array([i for i, image in enumerate(self.images) if (image.labels > 0).any()], dtype=np.int64)
+
+    def _draw(self, rng: np.random.Generator) -> int:
+        """A random image, more often one with pedestrians or cyclists."""
+        if len(self._rare) and rng.random() < self.augmentation.sought:
+            return int(rng.choice(self._rare))
+        return int(rng.integers(len(self.images)))
+
+    def loss(self, network: Any, batch: Any) -> dict[str, Any]:
+        """Weighted terms of score, box and mask."""
+        from lcf3d.training.camera_losses import Targets, losses
+
+        outputs = network(batch["pixels"].float() / 255)
+        targets = Targets(
+            batch["image"],
+            batch["boxes"],
+            batch["visible"],
+            batch["labels"],
+            batch.get("owner"),
+            batch["numbers"],
+        )
+        return losses(outputs, targets, self.view)
+
+    def validate(self, network: Any) -> dict[str, float]:
+        """Average precision and mask IoU of the exported network on the held-out images."""
+        if not self.held_out:
+            return {}
+        from lcf3d.detectors.camera.onnx import OnnxDetector
+        from lcf3d.detectors.camera.small_export import export_small
+
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "camera.onnx"
+            export_small(network, path)
+            detector = OnnxDetector(path, score_threshold=0.02, threads=1)
+            return evaluate_detector(detector, self.held_out).figures()
