@@ -4,14 +4,13 @@
     python benchmarks/localizer_kitti.py /data/kitti --split sensor_val --boxes /data/kitti/results/rcnn_2d/data
 
 The frustums come from the labels' own 2D boxes, or (``--boxes``) from the 2D detections of a folder of KITTI result
-files, each taken with the label of its class that it overlaps most (IoU of 0.5 or more). ``--localizer`` names any
-class that is a `lcf3d.localizers.base.Localizer` and needs no arguments, so that a network stands in the same table.
+files, each taken with the label of its class that it overlaps most (IoU of 0.5 or more). ``--localizer`` is what
+``lcf3d run --localizer`` takes: geometric, network, hybrid, onnx:FILE, ...
 """
 
 from __future__ import annotations
 
 import argparse
-import importlib
 import json
 import time
 from dataclasses import asdict, dataclass
@@ -28,6 +27,7 @@ from lcf3d.geometry.boxes import lidar_from_kitti
 from lcf3d.geometry.camera import project_boxes
 from lcf3d.geometry.iou import bev_iou, image_iou, iou_3d
 from lcf3d.localizers.base import Localizer
+from lcf3d.localizers.named import load_localizer
 from lcf3d.structures import KITTI_CLASSES, Camera, Detections2D, FloatArray
 
 # a recovered box is confirmed when its image IoU exceeds this (paper, tau_d)
@@ -176,12 +176,11 @@ def main() -> None:
     parser.add_argument("--boxes", type=Path, help="folder of KITTI result files; default: the labels' 2D boxes")
     parser.add_argument("--score", type=float, default=0.5, help="least score of a 2D detection")
     parser.add_argument("--jitter", type=float, default=0.0, help="move the edges of label boxes by up to this share")
-    parser.add_argument("--localizer", default="lcf3d.localizers.geometric:GeometricLocalizer", help="module:class")
+    parser.add_argument("--localizer", default="hybrid", help="as for lcf3d run")
     parser.add_argument("--json", type=Path, help="write every object's figures to this file")
     parser.add_argument("--each", action="store_true", help="print every object")
     arguments = parser.parse_args()
-    module, name = arguments.localizer.split(":")
-    localizer: Localizer = getattr(importlib.import_module(module), name)()
+    localizer = load_localizer(arguments.localizer)
     rows, asked, seconds = measure(
         arguments.root, arguments.split, localizer, arguments.boxes, arguments.score, arguments.jitter
     )

@@ -29,6 +29,7 @@ def ablate(
     ] = "auto",
     config: Annotated[str, typer.Option(help="preset or YAML file that the variants change")] = "kitti",
     set_: Annotated[list[str] | None, typer.Option("--set", help="change a setting, name=value; repeatable")] = None,
+    localizer: Annotated[str, typer.Option(help="for recovery, as for lcf3d run")] = "hybrid",
     tiles: Annotated[int, typer.Option(min=1, help="overlapping tiles across wide images, for onnx: detectors")] = 1,
     missing: Annotated[str, typer.Option(help="result files that are not there: error, or empty")] = "error",
     json_: Annotated[bool, typer.Option("--json", help="print the rows as JSON")] = False,
@@ -48,13 +49,15 @@ def ablate(
     from lcf3d.cli.calibrate import plain, tracked, wide_console
     from lcf3d.cli.run_setup import RunRequest
     from lcf3d.evaluation.ablation import ablate as measure
+    from lcf3d.localizers.named import load_localizer
 
     request = RunRequest(
         dataset, lidar, {"left": camera}, split, config=config, changes=tuple(set_ or ()), tiles=tiles, missing=missing
     )
     inputs, truth, settings = _read(request)
     scores = _calibration(calibration, inputs, settings)
-    rows = measure(inputs, truth, settings, scores, progress=plain if json_ else tracked)
+    chosen, progress = load_localizer(localizer), plain if json_ else tracked
+    rows = measure(inputs, truth, settings, scores, chosen, progress)
     scans = all(item.frame.points is not None for item in inputs)
     if json_:
         typer.echo(json.dumps({"frames": len(inputs), "scans": scans, "rows": [r.to_json() for r in rows]}, indent=2))
