@@ -1,4 +1,8 @@
 import json
+import os
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -105,3 +109,31 @@ def test_the_rate_rises_and_falls():
     for bad in ({"steps": 0}, {"learning_rate": 0.0}):
         with pytest.raises(ConfigError):
             TrainingSettings(**{"steps": 10, **bad})
+
+
+def test_two_processes_train_one_network(tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(
+        "import os, sys, torch\n"
+        "from pathlib import Path\n"
+        "from lcf3d.training.loop import train\n"
+        "from tests.training.test_loop import SETTINGS, Line\n"
+        "rank = os.environ['RANK']\n"
+        "seen = []\n"
+        "class Noted(Line):\n"
+        "    def loss(self, network, batch):\n"
+        "        seen.append(float(batch['x'].sum()))\n"
+        "        self.last = network\n"
+        "        return super().loss(network, batch)\n"
+        "task = Noted()\n"
+        "train(task, SETTINGS, Path(sys.argv[1]))\n"
+        "weights = torch.cat([p.detach().flatten() for p in task.last.parameters()])\n"
+        "torch.save({'weights': weights, 'seen': torch.tensor(seen)}, Path(sys.argv[1]) / f'rank{rank}.pt')\n"
+    )
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", str(script)]
+    root = Path(__file__).parents[2]
+    subprocess.run([*command, str(tmp_path)], check=True, cwd=root, env={**os.environ, "PYTHONPATH": str(root)})
+    one, two = (torch.load(tmp_path / f"rank{rank}.pt", weights_only=True) for rank in (0, 1))
+    assert torch.allclose(one["weights"], two["weights"])
+    assert not torch.allclose(one["seen"], two["seen"]), "each has batches of its own"
+    assert torch.load(tmp_path / LAST, weights_only=True)["step"] == SETTINGS.steps
