@@ -207,3 +207,13 @@ def test_the_command_writes_a_data_set_and_refuses_bad_input(tmp_path, tiny_pres
     assert (tmp_path / "out" / "training" / "label_2" / "000000.txt").exists()
     again = runner.invoke(app, ["simulate", str(tmp_path / "out"), "--frames", "1", "--preset", "sparse16"])
     assert isinstance(again.exception, ConfigError)
+
+
+def test_a_data_set_of_one_camera_is_complete_without_the_other(tmp_path):
+    recipe = Recipe("mono64", 1, seed=3)
+    write_dataset(recipe, tmp_path)
+    folders = {path.name for path in (tmp_path / "training").iterdir()}
+    assert folders == {"calib", "velodyne", "image_2", "instance_2", "tracks", "label_2"}
+    counts: list[int] = []
+    write_dataset(recipe, tmp_path, resume=True, progress=counts.append)
+    assert counts == [1], "nothing is left to do"

@@ -35,8 +35,12 @@ def frame_paths(root: Path, id: str) -> dict[str, Path]:
 
 
 def is_complete(root: Path, id: str) -> bool:
-    """Whether all files of a frame are there (each is written whole or not at all)."""
-    return all(path.exists() for path in frame_paths(root, id).values())
+    """Whether all files of a frame are there (each is written whole or not at all).
+
+    A data set without a right camera has no folder of its images.
+    """
+    paths = frame_paths(root, id)
+    return all(path.exists() for path in paths.values() if path.parent.name != "image_3" or path.parent.is_dir())
 
 
 def write_frame(root: Path, id: str, simulated: SimulatedFrame) -> None:
@@ -48,8 +52,8 @@ def write_frame(root: Path, id: str, simulated: SimulatedFrame) -> None:
     paths = frame_paths(root, id)
     write_text(paths["calib"], calibration_text(simulated.preset))
     write_bytes(paths["velodyne"], np.ascontiguousarray(simulated.scan.points, dtype="<f4").tobytes())
-    for camera, folder in IMAGE_FOLDERS.items():
-        write_png(paths[folder], simulated.renders[camera].image)
+    for camera, render in simulated.renders.items():
+        write_png(paths[IMAGE_FOLDERS[camera]], render.image)
     write_png(paths["instance_2"], simulated.renders["left"].owner.astype(np.uint16))
     order = label_order(
         simulated.actors, simulated.boxes, simulated.sightings["left"], simulated.points_on, simulated.preset.cameras[0]

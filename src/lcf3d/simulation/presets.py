@@ -234,6 +234,12 @@ def all_presets() -> dict[str, Preset]:
     every = (
         kitti,
         nuscenes,
+        replace(
+            kitti,
+            name="mono64",
+            cameras=kitti.cameras[:1],
+            description="kitti64 with the left camera only: quicker, for large sets",
+        ),
         replace(kitti, name="sparse16", lidar=VLP16, description="kitti64 with a 16-beam LiDAR"),
         replace(kitti, name="rain", rain=0.7, description="kitti64 in rain: lost beams, droplets, wet road, haze"),
         replace(kitti, name="night", night=True, description="kitti64 at night: head and street lamps"),
