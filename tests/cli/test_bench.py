@@ -33,3 +33,23 @@ def test_bad_arguments(arguments, message):
         pytest.importorskip("torch")
     with pytest.raises(Lcf3dError, match=message):
         bench(*arguments)
+
+
+def test_networks_by_name(monkeypatch):
+    pytest.importorskip("torchvision")
+    from lcf3d.detectors.camera import torchvision_benchmarking
+    from lcf3d.detectors.lidar import benchmarking
+
+    def costs(runtime):
+        return lambda names: [benchmarking.Cost(name, runtime, "cpu", None, 1.0, None, 2.0, None) for name in names]
+
+    monkeypatch.setattr(benchmarking, "benchmark", costs("lidar"))
+    monkeypatch.setattr(torchvision_benchmarking, "benchmark_camera", costs("camera"))
+    rows = json.loads(
+        bench("detectors", "--name", "fasterrcnn-r50-nuscenes", "--name", "second-kitti", "--name", "yolo", "--json")
+    )
+    assert [(row["name"], row["runtime"]) for row in rows] == [
+        ("second-kitti", "lidar"),
+        ("yolo", "lidar"),
+        ("fasterrcnn-r50-nuscenes", "camera"),
+    ]

@@ -21,7 +21,7 @@ from lcf3d.detectors.checkpoints import (  # noqa: E402
 from lcf3d.detectors.lidar import PointPillars, load  # noqa: E402
 from lcf3d.detectors.lidar.presets import PRESETS  # noqa: E402
 from lcf3d.detectors.openpcdet import translate  # noqa: E402
-from lcf3d.errors import DetectorError  # noqa: E402
+from lcf3d.errors import ConfigError, DetectorError  # noqa: E402
 
 
 def meta_state(preset):
@@ -133,6 +133,30 @@ def test_a_loaded_detector_runs_in_the_wanted_classes(pointpillars_file):
     assert len(found) > 0
 
 
+def test_half_precision_is_for_storage(pointpillars_file, tmp_path):
+    state = torch.load(pointpillars_file, weights_only=True)["state_dict"]
+    half = {name: value.half() if value.is_floating_point() else value for name, value in state.items()}
+    torch.save(half, tmp_path / "half.pth")
+    detector = PointPillars.from_checkpoint(tmp_path / "half.pth")
+    assert all(p.dtype == torch.float32 for p in detector.network.parameters())
+
+
+def test_parameters_of_a_failed_training(pointpillars_file, tmp_path):
+    state = torch.load(pointpillars_file, weights_only=True)["state_dict"]
+    state["backbone.blocks.0.0.weight"][0, 0, 0, 0] = float("nan")
+    torch.save(state, tmp_path / "nan.pth")
+    with pytest.raises(DetectorError, match=r"parameter backbone\.blocks\.0\.0\.weight .* is NaN"):
+        load(str(tmp_path / "nan.pth"))
+
+
+def test_devices_that_are_not_there(pointpillars_file):
+    with pytest.raises(ConfigError, match=r"torch cannot use device 'gpu' here .*; use device=cpu"):
+        load(str(pointpillars_file), device="gpu")
+    if not torch.cuda.is_available():
+        with pytest.raises(ConfigError, match="torch cannot use device 'cuda' here"):
+            load(str(pointpillars_file), device="cuda")
+
+
 def openpcdet_names(state):
     """The names OpenPCDet gives the layers of PointPillars and SECOND, spelt out independently of the translation."""
     renamed = {}
@@ -188,3 +212,50 @@ def test_second_stage_names_of_openpcdet():
     translated = translate({name: torch.empty(shape) for name, shape in shapes.items()})
     assert {name: tuple(value.shape) for name, value in translated.items()} == expected
     assert set(expected) <= set(meta_state("pv-rcnn-kitti"))
+
+
+# the layers of OpenPCDet's pv_rcnn.yaml beside the sparse backbone and the first stage, and the shapes of their weights
+OPENPCDET_SECOND_STAGE = {
+    **{
+        f"pfe.SA_{where}.mlps.{scale}.{layer}": shape
+        for where, before, after in (
+            ("rawpoints", 4, 16),
+            ("layers.0", 19, 16),
+            ("layers.1", 35, 32),
+            ("layers.2", 67, 64),
+            ("layers.3", 67, 64),
+        )
+        for scale in (0, 1)
+        for layer, shape in ((0, (after, before, 1, 1)), (3, (after, after, 1, 1)))
+    },
+    "pfe.vsa_point_feature_fusion.0": (128, 640),
+    "point_head.cls_layers.0": (256, 640),
+    "point_head.cls_layers.3": (256, 256),
+    "point_head.cls_layers.6": (1, 256),
+    **{
+        f"roi_head.roi_grid_pool_layer.mlps.{scale}.{layer}": (64, before, 1, 1)
+        for scale in (0, 1)
+        for layer, before in ((0, 131), (3, 64))
+    },
+    "roi_head.shared_fc_layer.0": (256, 27648, 1),
+    "roi_head.shared_fc_layer.4": (256, 256, 1),
+    "roi_head.cls_layers.0": (256, 256, 1),
+    "roi_head.cls_layers.4": (256, 256, 1),
+    "roi_head.cls_layers.7": (1, 256, 1),
+    "roi_head.reg_layers.0": (256, 256, 1),
+    "roi_head.reg_layers.4": (256, 256, 1),
+    "roi_head.reg_layers.7": (7, 256, 1),
+}
+
+
+def test_a_whole_pv_rcnn_of_openpcdet():
+    foreign = openpcdet_names(meta_state("second-kitti-openpcdet"))
+    for layer, shape in OPENPCDET_SECOND_STAGE.items():
+        head, _, number = layer.rpartition(".")
+        foreign[f"{layer}.weight"] = torch.empty(shape, device="meta")
+        if shape[0] in (1, 7):
+            foreign[f"{layer}.bias"] = torch.empty(shape[:1], device="meta")
+            continue
+        for part in ("weight", "bias", "running_mean", "running_var"):
+            foreign[f"{head}.{int(number) + 1}.{part}"] = torch.empty(shape[:1], device="meta")
+    assert find_config(foreign).name == "pv-rcnn-kitti-openpcdet"

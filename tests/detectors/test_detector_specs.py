@@ -89,3 +89,16 @@ def test_builtin_kinds_exist() -> None:
         for target in kinds.values():
             module, _, name = target.partition(":")
             assert callable(getattr(import_module(module), name))
+
+
+def test_settings_of_the_wrong_kind(third_party: None) -> None:
+    with pytest.raises(ConfigError, match="setting 'strength' of detector kind 'blind' must be a number, got 'high'"):
+        load_detector("blind:x?strength=high", "camera", ("Car",))
+
+
+def test_a_name_that_looks_like_a_number(monkeypatch: pytest.MonkeyPatch) -> None:
+    def build(argument: str, class_names: Sequence[str], preset: str | None = None, size: int | str = 1) -> object:
+        return preset, size
+
+    monkeypatch.setattr(specs, "_callable", lambda kind, sensor: build)
+    assert load_detector("mine:x?preset=2024&size=640", "camera", ("Car",)) == ("2024", 640)

@@ -83,11 +83,14 @@ def _simulation() -> list[dict[str, Any]]:
 
 
 def _detectors(names: list[str] | None) -> list[dict[str, Any]]:
-    from lcf3d.detectors.camera.torchvision_benchmarking import benchmark_camera
+    from lcf3d.detectors.camera.torchvision_benchmarking import NETWORKS, benchmark_camera
     from lcf3d.detectors.lidar.benchmarking import benchmark
 
-    camera = [] if names else benchmark_camera()
-    return [cost.to_dict() for cost in (*benchmark(names), *camera)]
+    if not names:
+        return [cost.to_dict() for cost in (*benchmark(), *benchmark_camera())]
+    lidar = benchmark([name for name in names if name not in NETWORKS])
+    camera = benchmark_camera([name for name in names if name in NETWORKS])
+    return [cost.to_dict() for cost in (*lidar, *camera)]
 
 
 def _row(timing: Timing) -> dict[str, Any]:

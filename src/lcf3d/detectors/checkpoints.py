@@ -135,14 +135,22 @@ def load_parameters(network: Any, state: Mapping[str, Any], name: str) -> None:
 
     Raises:
         DetectorError: names or shapes differ; the message lists missing, unexpected and differently shaped ones.
+            Or a parameter is not finite.
     """
+    import torch
+
     state = fit_layouts(network, published_names(state))
     report = difference(network, state)
     if report:
         raise DetectorError(f"the checkpoint does not fit {name}: {report}")
+    for key, value in state.items():
+        if value.is_floating_point() and not torch.isfinite(value).all():
+            raise DetectorError(f"parameter {key} of the checkpoint for {name} is NaN or infinite; use an earlier one")
     counters = {key: value for key, value in network.state_dict().items() if key.endswith("num_batches_tracked")}
     zeros = {key: _zeros(value) for key, value in counters.items() if key not in state}
-    network.load_state_dict({key: value.clone() for key, value in {**zeros, **state}.items()}, assign=True)
+    # half precision is for storage here: the networks compute in float32
+    full = {key: value.float() if value.is_floating_point() else value for key, value in {**zeros, **state}.items()}
+    network.load_state_dict({key: value.clone() for key, value in full.items()}, assign=True)
 
 
 def _zeros(value: Any) -> Any:

@@ -19,6 +19,7 @@ A camera detector's callable is called as ``callable(argument, class_names=..., 
 from __future__ import annotations
 
 import inspect
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -121,6 +122,7 @@ def load_detector(
         if unknown:
             have = ", ".join(sorted(known)) or "none"
             raise ConfigError(f"detector kind {spec.kind!r} has no setting {unknown[0]!r}; its settings: {have}")
+    settings = {name: _fitted(spec.kind, name, value, build) for name, value in settings.items()}
     return build(spec.argument, class_names=tuple(class_names), **settings)
 
 
@@ -149,6 +151,20 @@ def _settings(build: Any) -> set[str] | None:
     # what a partial has bound is part of the kind, not a setting
     bound = build.keywords if isinstance(build, partial) else {}
     return {p.name for p in parameters if p.kind is not p.VAR_POSITIONAL} - {"class_names", *bound}
+
+
+def _fitted(kind: str, name: str, value: Setting, build: Any) -> Setting:
+    """``value`` as the type of the parameter ``name``, where that is plain.
+
+    Raises:
+        ConfigError: a word where a number is wanted.
+    """
+    parameter = inspect.signature(build).parameters.get(name)
+    wanted = set(re.findall(r"\w+", str(parameter.annotation))) if parameter is not None else set()
+    if isinstance(value, str) and wanted and wanted <= {"int", "float", "bool", "None"}:
+        raise ConfigError(f"setting {name!r} of detector kind {kind!r} must be a number, got {value!r}")
+    # a name or path that looks like a number
+    return str(value) if "str" in wanted and not wanted & {"int", "float", "bool"} else value
 
 
 def _value(text: str) -> Setting:

@@ -24,7 +24,7 @@ from lcf3d.detectors.camera.torchvision_boxes import (
 )
 from lcf3d.detectors.checkpoints import load_parameters, read_state_dict
 from lcf3d.detectors.classes import to_classes
-from lcf3d.detectors.lidar._torch import Tensor, functional, nn, torch
+from lcf3d.detectors.lidar._torch import Tensor, functional, nn, torch, torch_device
 from lcf3d.errors import ConfigError, DetectorError, MissingExtraError, ShapeError
 from lcf3d.structures import KITTI_CLASSES, Detections2D
 
@@ -245,7 +245,7 @@ class TorchvisionFasterRCNN:
 
     Raises:
         DetectorError: the file cannot be read, or is no Faster R-CNN with ResNet-50 or -101 and FPN.
-        ConfigError: unknown style.
+        ConfigError: unknown style or device.
     """
 
     def __init__(
@@ -285,7 +285,7 @@ class TorchvisionFasterRCNN:
         with torch.device("meta"):
             network = FasterRCNNNetwork(depth, self.style)
         load_parameters(network, state, f"Faster R-CNN with ResNet-{depth} and FPN")
-        self.device = torch.device(device)
+        self.device = torch_device(device)
         self.network = network.eval().requires_grad_(False).to(self.device)
         self.class_names = self.style.classes if class_names is None else tuple(class_names)
         self.score_threshold = score_threshold

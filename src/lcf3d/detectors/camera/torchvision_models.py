@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from lcf3d.detectors.base import Image
 from lcf3d.detectors.checkpoints import load_parameters, read_state_dict
 from lcf3d.detectors.classes import COCO_CLASSES, read_class_names, to_classes
-from lcf3d.detectors.lidar._torch import nn, torch
+from lcf3d.detectors.lidar._torch import nn, torch, torch_device
 from lcf3d.errors import ConfigError, DetectorError, MissingExtraError, ShapeError
 from lcf3d.structures import Detections2D, InstanceMask
 
@@ -59,7 +59,7 @@ class TorchvisionDetector:
         device: torch device.
 
     Raises:
-        ConfigError: an unknown name, a threshold out of [0, 1], or ``names`` without a checkpoint.
+        ConfigError: an unknown name or device, a threshold out of [0, 1], or ``names`` without a checkpoint.
         DetectorError: there are no weights and no checkpoint, the download failed, or the checkpoint does not fit.
         MissingExtraError: torch or torchvision is not installed.
     """
@@ -84,7 +84,7 @@ class TorchvisionDetector:
         outputs = _outputs(state, name)
         self.own_class_names, self._own_labels = _own_classes(names, outputs, checkpoint)
         self.class_names = self.own_class_names if class_names is None else tuple(class_names)
-        self.device = torch.device(device)
+        self.device = torch_device(device)
         self.network = build_network(name, state, outputs, score_threshold).to(self.device)
 
     def __call__(self, images: Sequence[Image]) -> list[Detections2D]:

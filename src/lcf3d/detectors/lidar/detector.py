@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import Self
 
-from lcf3d.detectors.lidar._torch import Tensor, nn, torch
+from lcf3d.detectors.lidar._torch import Tensor, nn, torch, torch_device
 from lcf3d.detectors.lidar.config import LidarConfig
 from lcf3d.detectors.lidar.fusing import fuse_batch_norm
 from lcf3d.detectors.lidar.inputs import Inputs, map_detections, pillar_inputs
@@ -32,7 +32,7 @@ class TorchLidarDetector(ABC):
         candidates: best boxes considered before suppression; the configuration's own number without it.
 
     Raises:
-        ConfigError: ``nms``, ``score_threshold`` or ``candidates`` makes no sense.
+        ConfigError: ``nms``, ``score_threshold`` or ``candidates`` makes no sense, or there is no such device.
     """
 
     architecture: ClassVar[str]
@@ -52,7 +52,7 @@ class TorchLidarDetector(ABC):
         self.config = config if candidates is None else config.with_candidates(candidates)
         self.nms = nms
         self.score_threshold = config.suppression.score_threshold if score_threshold is None else score_threshold
-        self.device = torch.device(device)
+        self.device = torch_device(device)
         self.network = channels_innermost(network.eval().requires_grad_(False).to(self.device))
 
     @classmethod
