@@ -53,7 +53,7 @@ def test_an_interrupted_training_ends_like_one_that_was_not(trained, tmp_path):
 
 def test_it_learns_one_scan_by_heart(tmp_path):
     only = ScanSource(lambda i: scene(0, 3), 1, 0.0)
-    calm = replace(TASK.augmentation, scale=0, drop=0, intensity_gain=0, intensity_offset=0, intensity_noise=0)
+    calm = replace(TASK.augmentation, scale=0, tilt=0, drop=0, intensity_gain=0, intensity_offset=0, intensity_noise=0)
     task = LidarTask(only, None, CONFIG, 1, (64, 64), 1, calm)
     losses = []
     settings = TrainingSettings(steps=30, learning_rate=4e-3, checkpoint_every=30, average=0)
@@ -92,12 +92,21 @@ def test_checkpoint_to_onnx(trained, tmp_path):
     np.testing.assert_allclose(found.scores, wanted.scores, atol=1e-4)
 
 
+def test_a_training_can_begin_with_another(trained):
+    network, folder = trained
+    begun = replace(TASK, start=folder / "last.pt").network()
+    for name, value in network.state_dict().items():
+        assert torch.equal(value, begun.state_dict()[name]), name
+
+
 def test_checkpoints_of_another_network(trained, tmp_path):
     state = torch.load(trained[1] / "last.pt", weights_only=True)
     state["averaged"].pop("bbox_head.task_heads.0.bias")
     torch.save(state, tmp_path / "last.pt")
     with pytest.raises(DetectorError, match=r"another architecture.*task_heads\.0\.bias"):
         checkpoint_detector(tmp_path / "last.pt", CONFIG)
+    with pytest.raises(DetectorError, match="another architecture"):
+        replace(TASK, start=tmp_path / "last.pt").network()
     with pytest.raises(DetectorError, match="does not exist"):
         checkpoint_detector(tmp_path / "none.pt", CONFIG)
     with pytest.raises(ConfigError, match="no centre head"):

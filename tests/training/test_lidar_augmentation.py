@@ -17,6 +17,7 @@ from lcf3d.training.lidar_augmentation import (
     crop,
     mirrored,
     scaled,
+    tilted,
     turned,
 )
 from lcf3d.training.lidar_scans import IGNORED
@@ -30,9 +31,19 @@ def bright_in(scan):
     return points_in_boxes(scan.points[scan.points[:, 3] > 0.5], scan.boxes).sum(axis=1)
 
 
-@pytest.mark.parametrize("change", [lambda s: turned(s, 2.0), mirrored, lambda s: scaled(s, 1.05)])
+@pytest.mark.parametrize(
+    "change", [lambda s: turned(s, 2.0), mirrored, lambda s: scaled(s, 1.05), lambda s: tilted(s, 0, 0, 0.2)]
+)
 def test_points_stay_in_their_boxes(change):
     assert (bright_in(change(scene(0))) == 40).all()
+
+
+def test_tilted_ground_carries_the_boxes():
+    scan = tilted(scene(0), 0.01, -0.02, 0.1)
+    moved = scan.boxes - scene(0).boxes
+    np.testing.assert_allclose(moved[:, 2], 0.01 * scan.boxes[:, 1] - 0.02 * scan.boxes[:, 0] + 0.1)
+    assert (moved[:, [0, 1, 3, 4, 5, 6]] == 0).all()
+    assert (bright_in(scan) >= 36).all()
 
 
 def test_turning_back_gives_the_scan():
@@ -63,7 +74,7 @@ def test_the_same_generator_gives_the_same_scan():
 
 def test_pasted_objects_have_room_and_their_points():
     objects = collect_objects(SCENES, 3, 10)
-    quiet = AugmentationSettings(drop=0, scale=0, intensity_gain=0, intensity_offset=0, intensity_noise=0)
+    quiet = AugmentationSettings(drop=0, scale=0, tilt=0, intensity_gain=0, intensity_offset=0, intensity_noise=0)
     added = 0
     for seed in range(8):
         rng = np.random.default_rng(seed)

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from lcf3d.errors import ConfigError
 
 if TYPE_CHECKING:
+    from lcf3d.training.lidar import LidarTask
     from lcf3d.training.lidar_scans import ScanSource
 
 VALIDATED = 24
@@ -34,6 +36,8 @@ def lidar(
     steps: Annotated[int, typer.Option(min=1)] = 3600,
     batch_size: Annotated[int, typer.Option(min=1, help="windows a step, 36 m x 38 m each, two of a scan")] = 4,
     learning_rate: Annotated[float, typer.Option(help="highest one of the schedule")] = 3e-3,
+    tilt: Annotated[float, typer.Option(min=0, help="degrees that scans are tilted by at most")] = 0.6,
+    start: Annotated[Path | None, typer.Option(help="last.pt of another training to begin with")] = None,
     seed: Annotated[int, typer.Option(min=0, help="of weights and batches")] = 0,
     checkpoint_every: Annotated[int, typer.Option(min=1, help="steps between checkpoints and validations")] = 500,
     workers: Annotated[int, typer.Option(min=0, help="processes that prepare batches")] = 0,
@@ -46,13 +50,12 @@ def lidar(
 
     lcf3d train lidar --out train-lidar
 
-    lcf3d train lidar kitti:KITTI --split train --steps 20000 --out train-lidar-kitti
+    lcf3d train lidar kitti:KITTI --split train --start train-lidar/last.pt --out train-lidar-kitti
     """
     from lcf3d.cli.train_common import train_with_progress
-    from lcf3d.detectors.lidar.export import export_onnx
     from lcf3d.detectors.lidar.presets import COMPACT_KITTI
-    from lcf3d.formats.files import write_json
-    from lcf3d.training.lidar import LidarTask, objects_of, trained_detector
+    from lcf3d.training.lidar import LidarTask, objects_of
+    from lcf3d.training.lidar_augmentation import AugmentationSettings
     from lcf3d.training.loop import TrainingSettings, import_torch
 
     torch = import_torch()
@@ -64,13 +67,29 @@ def lidar(
     last = scans.count - held_out
     learned, measured = scans.part(0, last), scans.part(last, scans.count)
     objects = objects_of(learned, COMPACT_KITTI)
-    task = LidarTask(learned, measured.part(0, VALIDATED), batch_size=batch_size, objects=objects)
+    task = LidarTask(
+        learned,
+        measured.part(0, VALIDATED),
+        batch_size=batch_size,
+        augmentation=AugmentationSettings(tilt=math.radians(tilt)),
+        objects=objects,
+        start=start,
+    )
     settings = TrainingSettings(
         steps, learning_rate, seed=seed, average=0.998, checkpoint_every=checkpoint_every, workers=workers
     )
     network = train_with_progress(task, settings, out, resume)
-    export_onnx(trained_detector(network, COMPACT_KITTI), out / "lidar.onnx")
-    figures = LidarTask(learned, measured).validate(network)
+    _write(LidarTask(learned, measured), network, out)
+
+
+def _write(task: LidarTask, network: Any, out: Path) -> None:
+    """Write the trained network and its figures on the held-out scans."""
+    from lcf3d.detectors.lidar.export import export_onnx
+    from lcf3d.formats.files import write_json
+    from lcf3d.training.lidar import trained_detector
+
+    export_onnx(trained_detector(network, task.config), out / "lidar.onnx")
+    figures = task.validate(network)
     write_json(out / "figures.json", figures)
     for name, value in figures.items():
         typer.echo(f"{name:<20}{value:>9.3f}")

@@ -44,6 +44,7 @@ class LidarTask:
         augmentation: how far scans are changed.
         objects: to be pasted into scans; see `objects_of`.
         box_weight: weight of the box terms beside that of the heat.
+        start: checkpoint of an earlier training whose averaged weights are begun with; random ones without it.
     """
 
     scans: ScanSource
@@ -55,12 +56,20 @@ class LidarTask:
     augmentation: AugmentationSettings = field(default_factory=AugmentationSettings)
     objects: ObjectDatabase | None = None
     box_weight: float = 2.0
+    start: Path | None = None
 
     def network(self) -> Any:
-        """The network with random weights."""
+        """The network with random weights, or with those of ``start``.
+
+        Raises:
+            DetectorError: ``start`` is no checkpoint, or of another architecture.
+        """
         from lcf3d.detectors.lidar.compact import CompactPillars
 
-        return CompactPillars.build(self.config)
+        network = CompactPillars.build(self.config)
+        if self.start is not None:
+            fill(network, load_checkpoint(self.start)["averaged"], str(self.start))
+        return network
 
     def batch(self, step: int, rng: np.random.Generator) -> dict[str, Any]:
         """Tensors of a step; see `center_losses` and `lcf3d.detectors.lidar.compact.CompactNetwork`."""

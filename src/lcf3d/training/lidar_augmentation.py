@@ -21,6 +21,7 @@ GROUND_M = 0.3
 """Points less than this above the bottom of a box may be the ground it stands on."""
 MOST_OBSTACLES = 5
 """A place with more points than this above the ground is taken."""
+TILT_REACH_M = 15.0
 RARE_WEIGHT = 4.0
 """How much more an object of another class than the first, which is the commonest, counts in choosing what to see."""
 ANYWHERE = 0.2
@@ -36,6 +37,8 @@ class AugmentationSettings:
     Attributes:
         angles: a turned scan shows one part of its surroundings; the best of so many random ones is taken.
         scale: largest relative change of size.
+        tilt: largest roll and pitch in radians; a scan is also raised or lowered, by as much as such a tilt does
+            `TILT_REACH_M` away. Roads are not flat, and the height of a box must come from its points.
         drop: largest share of the points that is left out.
         intensity_gain: largest relative change of all intensities of a scan.
         intensity_offset: largest value that is added to all of them.
@@ -46,6 +49,7 @@ class AugmentationSettings:
 
     angles: int = 3
     scale: float = 0.05
+    tilt: float = 0.01
     drop: float = 0.3
     intensity_gain: float = 0.4
     intensity_offset: float = 0.1
@@ -116,6 +120,8 @@ def augment(
     if objects is not None:
         scan = _paste(scan, area, objects, settings, rng)
     scan = scaled(scan, float(rng.uniform(1 - settings.scale, 1 + settings.scale)))
+    roll, pitch, heave = rng.uniform(-settings.tilt, settings.tilt, 3)
+    scan = tilted(scan, roll, pitch, heave * TILT_REACH_M)
     kept = rng.random(len(scan.points)) >= rng.uniform(0, settings.drop)
     points = scan.points[kept]
     gain = rng.uniform(1 - settings.intensity_gain, 1 + settings.intensity_gain)
@@ -177,6 +183,17 @@ def scaled(scan: LabelledScan, factor: float) -> LabelledScan:
     points, boxes = scan.points.copy(), scan.boxes.copy()
     points[:, :3] *= factor
     boxes[:, :6] *= factor
+    return replace(scan, points=points, boxes=boxes)
+
+
+def tilted(scan: LabelledScan, roll: float, pitch: float, heave: float) -> LabelledScan:
+    """The scan on ground that rises to the left (roll) and ahead (pitch), small angles in radians, raised by metres.
+
+    Things stay upright: heights change, and nothing else.
+    """
+    points, boxes = scan.points.copy(), scan.boxes.copy()
+    points[:, 2] += points[:, :2] @ np.array([pitch, roll], np.float32) + np.float32(heave)
+    boxes[:, 2] += boxes[:, :2] @ np.array([pitch, roll]) + heave
     return replace(scan, points=points, boxes=boxes)
 
 
