@@ -8,8 +8,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from lcf3d.errors import ConfigError
-
 if TYPE_CHECKING:
     from lcf3d.training.lidar import LidarTask
     from lcf3d.training.lidar_scans import ScanSource
@@ -62,10 +60,7 @@ def lidar(
     if threads:
         torch.set_num_threads(threads)
     scans = _scans(dataset, split, version, preset, frames, samples_seed, samples, jobs)
-    if scans.count <= held_out:
-        raise ConfigError(f"there are {scans.count} scans, too few to hold out {held_out}; lower --held-out")
-    last = scans.count - held_out
-    learned, measured = scans.part(0, last), scans.part(last, scans.count)
+    learned, measured = scans.hold_out(held_out)
     objects = objects_of(learned, COMPACT_KITTI)
     task = LidarTask(
         learned,

@@ -67,6 +67,16 @@ class ScanSource:
         """The scans from ``first`` up to and without ``last``."""
         return ScanSource(lambda i: self.read(first + i), min(last, self.count) - first, self.turn)
 
+    def hold_out(self, count: int) -> tuple[ScanSource, ScanSource]:
+        """The scans to learn from, and the last ``count`` to measure with.
+
+        Raises:
+            ConfigError: nothing would be left to learn from.
+        """
+        if self.count <= count:
+            raise ConfigError(f"there are {self.count} scans, too few to hold out {count}; hold out fewer")
+        return self.part(0, self.count - count), self.part(self.count - count, self.count)
+
 
 def simulated_scans(paths: Sequence[Path], class_names: Sequence[str]) -> ScanSource:
     """Scans of `lcf3d.training.samples`, which have boxes all around."""
