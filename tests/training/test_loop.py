@@ -100,6 +100,18 @@ def test_a_folder_in_use_other_settings_and_other_networks_are_refused(tmp_path)
         train(Line(), SETTINGS, tmp_path, resume=True)
 
 
+def test_a_training_begins_with_the_weights_of_another(tmp_path):
+    first = train(Line(), SETTINGS, tmp_path / "first")
+    nothing = TrainingSettings(1, 1e-12, average=0.0, checkpoint_every=1)
+    second = train(Line(), nothing, tmp_path / "second", start=tmp_path / "first" / LAST)
+    for a, b in zip(first.parameters(), second.parameters(), strict=True):
+        torch.testing.assert_close(a, b)
+    with pytest.raises(DetectorError, match="another architecture"):
+        train(Line(hidden=9), nothing, tmp_path / "third", start=tmp_path / "first" / LAST)
+    with pytest.raises(DetectorError, match="does not exist"):
+        train(Line(), nothing, tmp_path / "fourth", start=tmp_path / "nowhere.pt")
+
+
 def test_the_rate_rises_and_falls():
     settings = TrainingSettings(100, 1.0, warmup=0.1)
     assert settings.rate(0) == pytest.approx(0.1)

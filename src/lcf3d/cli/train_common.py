@@ -34,7 +34,9 @@ def prepare_samples(recipe: SampleRecipe, root: Path, jobs: int) -> list[Path]:
         return write_samples(recipe, root / recipe.folder, jobs, lambda n: bar.advance(task, n))
 
 
-def train_with_progress(task: TrainingTask, settings: TrainingSettings, out: Path, resume: bool) -> Any:
+def train_with_progress(
+    task: TrainingTask, settings: TrainingSettings, out: Path, resume: bool, start: Path | None = None
+) -> Any:
     """`lcf3d.training.loop.train` under a progress bar that shows loss and the last validation; gives the network.
 
     Raises:
@@ -68,4 +70,4 @@ def train_with_progress(task: TrainingTask, settings: TrainingSettings, out: Pat
                 figures = "  ".join(f"{name} {value:.3f}" for name, value in progress.validation.items())
                 console.print(f"step {progress.step}: loss {smooth:.3f}  {figures}", soft_wrap=True)
 
-        return train(task, settings, out, resume, report)
+        return train(task, settings, out, resume, report, start)

@@ -31,6 +31,9 @@ def localizer(
     seed: Annotated[int | None, typer.Option(min=0, help="of weights and batches")] = None,
     samples: Annotated[Path | None, typer.Option(help="folder that keeps simulated samples")] = None,
     jobs: Annotated[int, typer.Option(min=1, help="processes that simulate")] = 2,
+    init: Annotated[
+        Path | None, typer.Option(help="last.pt of another training, whose weights this one begins with")
+    ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="go on with a training that was interrupted")] = False,
 ) -> None:
     """Train a frustum localizer; without DATA on simulated scans, which rebuilds the network that is shipped.
@@ -54,11 +57,11 @@ def localizer(
     if form not in ("v1", "v2"):
         raise ConfigError(f"--form takes v1 or v2, got {form!r}")
     spec = LocalizerSpec.of(cast("Literal['v1', 'v2']", form), classes)
-    given = {"steps": steps, "learning_rate": learning_rate, "seed": seed}
+    given: dict[str, Any] = {"steps": steps, "learning_rate": learning_rate, "seed": seed}
     settings = replace(recipe.settings, **{name: value for name, value in given.items() if value is not None})
     pool, held_out = _pools(recipe, spec, data, split, val_split, samples, jobs)
     task = LocalizerTask(spec, pool, held_out, batch_size or recipe.batch_size, VARIANTS[variant], recipe.shares)
-    network = train_with_progress(task, settings, out, resume)
+    network = train_with_progress(task, settings, out, resume, init)
     path = _save(network, spec, out)
     typer.echo(f"{path}: use it with lcf3d run --localizer {'onnx' if form == 'v1' else 'frustum-pointnet'}:{path}")
 

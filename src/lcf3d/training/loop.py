@@ -105,6 +105,7 @@ def train(
     folder: Path,
     resume: bool = False,
     report: Callable[[Progress], None] = lambda _: None,
+    start: Path | None = None,
 ) -> Any:
     """Train a network; gives it with the averaged weights, in evaluation mode.
 
@@ -117,6 +118,7 @@ def train(
         folder: for checkpoints; must hold none unless ``resume``.
         resume: go on from the folder's checkpoint, if there is one.
         report: called after every step.
+        start: checkpoint of another training, whose averaged weights this one begins with.
 
     Raises:
         ConfigError: the folder holds a training already, or one with other settings.
@@ -126,6 +128,8 @@ def train(
     torch = import_torch()
     rank, world = _join(torch)
     run = _Run(torch, task, settings, folder, rank)
+    if start is not None:
+        run.start(start)
     first = run.resume() if resume else run.begin()
     network = run.network
     if world > 1:
@@ -168,6 +172,12 @@ class _Run:
         self.optimizer = torch.optim.AdamW(groups, lr=settings.learning_rate)
         self.history: list[dict[str, Any]] = []
         self._writer: Any = None
+
+    def start(self, path: Path) -> None:
+        """Take the averaged weights of another training."""
+        weights = load_checkpoint(path)["averaged"]
+        fill(self.network, weights, str(path))
+        fill(self.averaged, weights, str(path))
 
     def begin(self) -> int:
         if (self.folder / LAST).exists():
