@@ -78,6 +78,13 @@ def test_a_run_is_drawn_whole(run_folder: Path) -> None:
     assert all(pixels_of(p, "matched") > 100 for p in pictures)
 
 
+def test_boxes_that_nobody_believes_are_left_out(run_folder: Path, tmp_path: Path) -> None:
+    view(run_folder, "--frame", "000001", "--out", tmp_path / "all.png", "--no-truth")
+    view(run_folder, "--frame", "000001", "--out", tmp_path / "none.png", "--no-truth", "--min-score", 2)
+    assert pixels_of(tmp_path / "all.png", "matched") > 0
+    assert pixels_of(tmp_path / "none.png", "matched") == 0
+
+
 def test_chosen_frames_and_limit(run_folder: Path, tmp_path: Path) -> None:
     assert view(run_folder, "--frame", "000002", "--out", tmp_path / "a.png").strip() == str(tmp_path / "a.png")
     assert pixels_of(tmp_path / "a.png", "matched") > 100

@@ -86,6 +86,14 @@ def test_scene_of_a_fusion(fused: FusedDetections) -> None:
     assert left.texts == ("", "", "Pedestrian 0.50 few points")
 
 
+def test_scene_without_low_scores(fused: FusedDetections) -> None:
+    limit = float(np.median(fused.detections.scores))
+    scene = Scene.from_fused(fused, least_score=limit)
+    kept = fused.detections.boxes[fused.detections.scores >= limit]
+    np.testing.assert_array_equal(scene.boxes[: len(kept)], kept)
+    assert all(scene.stages[i] != "dropped" for i in range(len(kept)))
+
+
 def test_scene_of_detections() -> None:
     found = Detections3D(BOX, np.array([0.5]), np.array([0]), ("Car",))
     flat = Detections2D(np.array([[0, 0, 9, 9.0]]), np.array([0.25]), np.array([0]), ("Car",))

@@ -28,6 +28,7 @@ def view(
     ] = None,
     truth: Annotated[bool, typer.Option(help="also draw the ground truth, thin and white")] = True,
     limit: Annotated[int | None, typer.Option(min=1, help="draw at most so many frames")] = None,
+    min_score: Annotated[float, typer.Option(help="leave out boxes of a lower score")] = float("-inf"),
 ) -> None:
     """Draw frames: images with boxes coloured by stage, and the bird's-eye view.
 
@@ -49,7 +50,7 @@ def view(
     dataset = _open_run(run_folder) if run_folder else _open(source)
     shown = run_folder or results
     ids = _frame_ids(dataset, frame or [], shown, limit)
-    scene_of = _scenes(dataset, shown, truth)
+    scene_of = _scenes(dataset, shown, truth, min_score)
     paths = _paths(ids, out, run_folder)
     with Progress(disable=len(ids) < 2) as progress:
         for frame_id in progress.track(ids, description="drawing"):
@@ -120,7 +121,9 @@ def _frame_ids(
     return list(dict.fromkeys(chosen))[:limit]
 
 
-def _scenes(dataset: KittiDataset | NuscenesDataset, shown: Path | None, truth: bool) -> Callable[[Frame], Scene]:
+def _scenes(
+    dataset: KittiDataset | NuscenesDataset, shown: Path | None, truth: bool, min_score: float
+) -> Callable[[Frame], Scene]:
     """What to draw over a frame."""
     from lcf3d.datasets.kitti import KittiDataset
     from lcf3d.structures import Detections3D
@@ -134,13 +137,13 @@ def _scenes(dataset: KittiDataset | NuscenesDataset, shown: Path | None, truth: 
         from lcf3d.formats.run_folder import RunFolder
 
         folder = RunFolder(shown)
-        return lambda frame: Scene.from_fused(folder.read(frame.id), frame.labels if truth else None)
+        return lambda frame: Scene.from_fused(folder.read(frame.id), frame.labels if truth else None, min_score)
     if isinstance(dataset, KittiDataset):
-        return _kitti_scenes(dataset, shown, truth)
-    return _nuscenes_scenes(dataset, shown, truth)
+        return _kitti_scenes(dataset, shown, truth, min_score)
+    return _nuscenes_scenes(dataset, shown, truth, min_score)
 
 
-def _kitti_scenes(dataset: KittiDataset, folder: Path, truth: bool) -> Callable[[Frame], Scene]:
+def _kitti_scenes(dataset: KittiDataset, folder: Path, truth: bool, min_score: float) -> Callable[[Frame], Scene]:
     """KITTI result files: 3D boxes where they have them, else 2D boxes in the left camera."""
     from lcf3d.formats.kitti import detections_2d, detections_3d, read_objects
     from lcf3d.visualization.scene import Scene
@@ -155,12 +158,13 @@ def _kitti_scenes(dataset: KittiDataset, folder: Path, truth: bool) -> Callable[
             detections_3d(objects, camera.camera_from_lidar, dataset.class_names),
             {camera.name: detections_2d(flat, dataset.class_names)} if len(flat) else {},
             frame.labels if truth else None,
+            min_score,
         )
 
     return scene
 
 
-def _nuscenes_scenes(dataset: NuscenesDataset, path: Path, truth: bool) -> Callable[[Frame], Scene]:
+def _nuscenes_scenes(dataset: NuscenesDataset, path: Path, truth: bool, min_score: float) -> Callable[[Frame], Scene]:
     """A nuScenes submission file."""
     from lcf3d.formats.nuscenes import read_submission
     from lcf3d.formats.nuscenes_boxes import detections_from_global, split_by_sample
@@ -172,7 +176,7 @@ def _nuscenes_scenes(dataset: NuscenesDataset, path: Path, truth: bool) -> Calla
         if frame.id not in boxes:
             raise ConfigError(f"{path} has no results for sample {frame.id}")
         found = detections_from_global(boxes[frame.id], dataset.lidar_from_global(frame.id))
-        return Scene.from_detections(found, truth=frame.labels if truth else None)
+        return Scene.from_detections(found, truth=frame.labels if truth else None, least_score=min_score)
 
     return scene
 

@@ -76,42 +76,53 @@ class Scene:
         detections: Detections3D,
         camera: Mapping[str, Detections2D] | None = None,
         truth: Detections3D | None = None,
+        least_score: float = -np.inf,
     ) -> Scene:
-        """Detections that went through no fusion."""
+        """Detections that went through no fusion; those of a lower score than ``least_score`` are left out."""
+        detections = detections[detections.scores >= least_score]
+        camera = {name: found[found.scores >= least_score] for name, found in (camera or {}).items()}
         return cls(
             detections.boxes,
             ("detection",) * len(detections),
             _texts(detections),
             {
                 name: ImageBoxes(found.boxes, np.ones(len(found), dtype=bool), _texts(found))
-                for name, found in (camera or {}).items()
+                for name, found in camera.items()
             },
             None if truth is None else truth.boxes,
         )
 
     @classmethod
-    def from_fused(cls, fused: FusedDetections, truth: Detections3D | None = None) -> Scene:
-        """Outputs of a fusion in the colour of their stage, and the inputs that were dropped on the way."""
+    def from_fused(
+        cls, fused: FusedDetections, truth: Detections3D | None = None, least_score: float = -np.inf
+    ) -> Scene:
+        """Outputs of a fusion in the colour of their stage, and the inputs that were dropped on the way.
+
+        Outputs and inputs of a lower score than ``least_score`` are left out.
+        """
         stages = [Stage(stage).name.lower() for stage in fused.stages]
         lowered = fused.lidar.output[fused.lidar.reason == Reason.DOWNWEIGHTED]
         for output in lowered[lowered >= 0]:
             stages[output] = "downweighted"
         dropped = fused.dropped_lidar
         dropped = dropped[~np.isin(fused.lidar.reason[dropped], _NOT_DRAWN)]
+        dropped = dropped[fused.lidar_inputs.scores[dropped] >= least_score]
+        shown = np.flatnonzero(fused.detections.scores >= least_score)
         return cls(
-            np.concatenate([fused.detections.boxes, fused.lidar_inputs.boxes[dropped]]),
-            (*stages, *("dropped",) * len(dropped)),
-            (*_texts(fused.detections), *("",) * len(dropped)),
-            _image_boxes(fused),
+            np.concatenate([fused.detections.boxes[shown], fused.lidar_inputs.boxes[dropped]]),
+            (*(stages[i] for i in shown), *("dropped",) * len(dropped)),
+            (*_texts(fused.detections[shown]), *("",) * len(dropped)),
+            _image_boxes(fused, least_score),
             None if truth is None else truth.boxes,
         )
 
 
-def _image_boxes(fused: FusedDetections) -> dict[str, ImageBoxes]:
+def _image_boxes(fused: FusedDetections, least_score: float) -> dict[str, ImageBoxes]:
     """The 2D detections that took part, with the reason where they led to nothing."""
     result = {}
     for c, (name, found) in enumerate(zip(fused.camera_names, fused.camera_inputs, strict=True)):
         rows = np.flatnonzero((fused.camera.camera == c) & ~np.isin(fused.camera.reason, _NOT_DRAWN))
+        rows = rows[found.scores[fused.camera.detection[rows]] >= least_score]
         chosen = found[fused.camera.detection[rows]]
         used = fused.camera.stage[rows] != Stage.DROPPED
         texts = [
