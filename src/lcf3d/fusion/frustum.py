@@ -81,7 +81,9 @@ class FrustumProposals:
     def select(self, chosen: IntArray) -> FrustumProposals:
         """The proposals of those indices, in that order."""
         index = np.concatenate([np.arange(self.offsets[k], self.offsets[k + 1]) for k in chosen] or [chosen[:0]])
-        second = None if self.second is None else SecondViews(*(part[chosen] for part in self.second))
+        second = self.second
+        if second is not None:
+            second = SecondViews(second.camera[chosen], second.detection[chosen], second.boxes2d[chosen])
         return replace(
             self,
             points=self.points[index],

@@ -144,7 +144,8 @@ def _chances(labels: IntArray, names: Sequence[str], shares: Mapping[str, float]
         rows = labels == k
         if name in shares and rows.any():
             chances[rows] = shares[name] * len(labels) / rows.sum()
-    return chances / chances.sum()
+    chances /= chances.sum()
+    return chances
 
 
 def _tensors(arrays: Mapping[str, Any]) -> dict[str, Any]:
