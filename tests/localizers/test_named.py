@@ -65,7 +65,7 @@ def test_names(tmp_path):
     with pytest.raises(DetectorError, match="does not exist"):
         load_localizer("onnx:nowhere.onnx")
     (tmp_path / "torn.onnx").write_bytes(b"no network")
-    with pytest.raises(DetectorError, match="is not an ONNX network"):
+    with pytest.raises(DetectorError, match="cannot be read as an ONNX file"):
         load_localizer(f"onnx:{tmp_path / 'torn.onnx'}")
 
 
@@ -80,5 +80,5 @@ def test_an_onnx_file_of_something_else_or_of_an_unknown_opset_is_refused(tmp_pa
         load_localizer(f"onnx:{tmp_path / 'other.onnx'}")
     model.opset_import[0].version = 999
     onnx.save(model, tmp_path / "opset.onnx")
-    with pytest.raises(DetectorError, match=r"is not an ONNX network that onnxruntime can run.*opset"):
+    with pytest.raises(DetectorError, match=r"cannot be read as an ONNX file: .*opset"):
         load_localizer(f"onnx:{tmp_path / 'opset.onnx'}")

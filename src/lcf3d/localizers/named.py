@@ -47,10 +47,10 @@ class ShippedLocalizer:
     """The networks that come with lcf3d: KITTI's for its three classes, nuScenes' for its ten; a `Localizer`.
 
     Args:
-        threads: threads of onnxruntime; 0 for one a core.
+        threads: threads of onnxruntime, 0 for one a core; the networks are so small that one is quickest.
     """
 
-    def __init__(self, threads: int = 0) -> None:
+    def __init__(self, threads: int = 1) -> None:
         self.threads = threads
 
     def __call__(self, proposals: FrustumProposals) -> tuple[FloatArray, FloatArray]:
@@ -66,9 +66,9 @@ def _shipped(dataset: str, threads: int) -> Localizer:
     return OnnxLocalizer(SHIPPED[dataset], threads)
 
 
-def default_localizer() -> Localizer:
-    """The better one for each class, as measured."""
-    return HybridLocalizer(ShippedLocalizer(), BY_NETWORK) if BY_NETWORK else GeometricLocalizer()
+def default_localizer(threads: int = 1) -> Localizer:
+    """The better one for each class, as measured; ``threads`` are those of the network, 0 for one a core."""
+    return HybridLocalizer(ShippedLocalizer(threads), BY_NETWORK) if BY_NETWORK else GeometricLocalizer()
 
 
 def load_localizer(text: str) -> Localizer:

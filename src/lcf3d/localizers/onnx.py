@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from lcf3d.detectors.onnx_session import open_session
 from lcf3d.errors import DetectorError
 from lcf3d.fusion.frustum import FrustumProposals
 from lcf3d.localizers.frustum_inputs import network_inputs
@@ -25,15 +26,15 @@ class OnnxLocalizer:
 
     Args:
         path: the file.
-        threads: threads of onnxruntime; 0 for one a core.
+        threads: threads of onnxruntime, 0 for one a core; the networks are so small that one is quickest.
 
     Raises:
         DetectorError: there is no such file, or it is no frustum network of lcf3d.
         ConfigError: it was written by a later version.
     """
 
-    def __init__(self, path: Path | str, threads: int = 0) -> None:
-        self._session = open_session(Path(path), threads)
+    def __init__(self, path: Path | str, threads: int = 1) -> None:
+        self._session = open_session(Path(path), threads, "a frustum network")
         metadata = self._session.get_modelmeta().custom_metadata_map
         if SPEC_KEY not in metadata:
             raise DetectorError(f"{path} is no frustum network of lcf3d: its metadata has no {SPEC_KEY}")
@@ -67,23 +68,3 @@ def localize(proposals: FrustumProposals, spec: LocalizerSpec, run: Any) -> tupl
         boxes[known] = decode_boxes(inputs.reference + centre, box, spec)
         quality[known] = np.clip(sure, 0, 1)
     return boxes, quality
-
-
-def open_session(path: Path, threads: int) -> Any:
-    """An onnxruntime session on the CPU.
-
-    Raises:
-        DetectorError: there is no such file, or onnxruntime can't run it.
-    """
-    import onnxruntime
-
-    if not path.is_file():
-        raise DetectorError(f"network {path} does not exist")
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = threads
-    options.log_severity_level = 3
-    try:
-        return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
-    except Exception as error:
-        # onnxruntime's exceptions share no base class but Exception
-        raise DetectorError(f"{path} is not an ONNX network that onnxruntime can run: {str(error)[:160]}") from None

@@ -77,5 +77,5 @@ def test_files_that_are_no_exported_network(tmp_path):
     with pytest.raises(DetectorError, match="does not exist"):
         OnnxLidarDetector(tmp_path / "nothing.onnx")
     (tmp_path / "text.onnx").write_text("not a network")
-    with pytest.raises(DetectorError, match="not an ONNX network"):
+    with pytest.raises(DetectorError, match="cannot be read as an ONNX file"):
         OnnxLidarDetector(tmp_path / "text.onnx")

@@ -15,6 +15,7 @@ from lcf3d.detectors.camera.onnx_images import instance_masks, prepare_image
 from lcf3d.detectors.camera.onnx_layouts import LAYOUTS, SIZES_INPUT, class_count, identify_layout
 from lcf3d.detectors.camera.tiling import merge_tiles, non_maximum_suppression, tile_spans
 from lcf3d.detectors.classes import COCO_CLASSES, read_class_names, to_classes
+from lcf3d.detectors.onnx_session import first_line, open_session
 from lcf3d.errors import ConfigError, DetectorError, ShapeError
 from lcf3d.structures import KITTI_CLASSES, Detections2D
 
@@ -71,7 +72,7 @@ class OnnxDetector:
         self._mapping = mapping
         self._imagenet = normalize == "imagenet"
         self._threads = threads
-        self._session = _open_session(self.path, threads)
+        self._session = open_session(self.path, threads, "a camera detector")
         metadata = self._session.get_modelmeta().custom_metadata_map
         image_input = self._image_input()
         self._image_name: str = image_input.name
@@ -145,14 +146,14 @@ class OnnxDetector:
         try:
             return list(self._session.run(self._outputs, inputs))
         except Exception as error:  # onnxruntime's exceptions share no base class
-            raise DetectorError(f"{self.path} cannot be run on an image: {_first_line(error)}") from error
+            raise DetectorError(f"{self.path} cannot be run on an image: {first_line(error)}") from error
 
     def __getstate__(self) -> dict[str, Any]:
         return {name: value for name, value in self.__dict__.items() if name != "_session"}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         # a session cannot travel to another process: each opens its own
-        self.__dict__.update(state, _session=_open_session(state["path"], state["_threads"]))
+        self.__dict__.update(state, _session=open_session(state["path"], state["_threads"], "a camera detector"))
 
     def _input_names(self) -> list[str]:
         return [node.name for node in self._session.get_inputs()]
@@ -222,23 +223,6 @@ def _check_settings(tiles: int, score_threshold: float, iou_threshold: float, la
         raise ConfigError(f"normalize must be none or imagenet, got {normalize!r}")
 
 
-def _open_session(path: Path, threads: int) -> Any:
-    """An onnxruntime session on the CPU."""
-    import onnxruntime
-
-    if not path.is_file():
-        raise DetectorError(f"{path} does not exist; expected the ONNX file of a camera detector")
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = threads
-    options.log_severity_level = 3
-    # waiting threads that spin doubled the time where other processes compute too
-    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    try:
-        return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
-    except Exception as error:  # onnxruntime's exceptions share no base class
-        raise DetectorError(f"{path} cannot be read as an ONNX file: {_first_line(error)}") from error
-
-
 def _parse_size(size: int | str | None) -> tuple[int, int] | None:
     """(height, width) from a side or ``HEIGHTxWIDTH``."""
     if size is None:
@@ -268,7 +252,3 @@ def _literal(text: str | None, kind: type) -> Any:
     except (ValueError, SyntaxError):
         return None
     return value if isinstance(value, kind) else None
-
-
-def _first_line(error: Exception) -> str:
-    return str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__

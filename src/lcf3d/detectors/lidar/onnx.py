@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from lcf3d.detectors.lidar.config import LidarConfig
 from lcf3d.detectors.lidar.inputs import encoder_inputs, map_detections
 from lcf3d.detectors.lidar.suppression import NmsMode, suppression_threshold
+from lcf3d.detectors.onnx_session import open_session
 from lcf3d.errors import ConfigError, DetectorError
 from lcf3d.structures import Detections3D
 
@@ -44,7 +45,7 @@ class OnnxLidarDetector:
         suppression_threshold(nms, 0.0)
         if score_threshold is not None and not 0 <= score_threshold < 1:
             raise ConfigError(f"score_threshold must be in [0, 1), got {score_threshold}")
-        self._session = _open(Path(path), threads)
+        self._session = open_session(Path(path), threads, "a LiDAR network")
         metadata = self._session.get_modelmeta().custom_metadata_map
         if CONFIG_KEY not in metadata:
             raise DetectorError(f"{path} was not exported by lcf3d: it holds no {CONFIG_KEY}")
@@ -77,19 +78,3 @@ class OnnxLidarDetector:
         if self.config.anchors is None:
             return list(groups.values())
         return [(maps["cls"], maps["reg"], maps["dir"]) for maps in groups.values()]
-
-
-def _open(path: Path, threads: int) -> Any:
-    """An onnxruntime session."""
-    import onnxruntime
-
-    if not path.is_file():
-        raise DetectorError(f"network {path} does not exist")
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = threads
-    options.log_severity_level = 3
-    try:
-        return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
-    except Exception as error:
-        # onnxruntime's exceptions share no base class but Exception
-        raise DetectorError(f"{path} is not an ONNX network that onnxruntime can run: {str(error)[:160]}") from None

@@ -1,0 +1,39 @@
+"""The one place where networks are opened with onnxruntime."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from lcf3d.errors import DetectorError
+
+
+def open_session(path: Path, threads: int, what: str) -> Any:
+    """An onnxruntime session on the CPU.
+
+    Args:
+        path: the ONNX file.
+        threads: that an operator uses; 0 for one a core.
+        what: the file should hold, in words, for the message.
+
+    Raises:
+        DetectorError: there is no such file, or onnxruntime cannot run it (damaged, of an unknown opset, ...).
+    """
+    import onnxruntime
+
+    if not path.is_file():
+        raise DetectorError(f"{path} does not exist; expected the ONNX file of {what}")
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = threads
+    options.log_severity_level = 3
+    # waiting threads that spin doubled the time where other processes compute too
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    try:
+        return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # onnxruntime's exceptions share no base class
+        raise DetectorError(f"{path} cannot be read as an ONNX file: {first_line(error)}") from error
+
+
+def first_line(error: Exception) -> str:
+    """The first line of an error's message, or its kind where it has none."""
+    return str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
