@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from lcf3d.errors import ConfigError
 
 if TYPE_CHECKING:
+    from lcf3d.training.camera import CameraTask
     from lcf3d.training.camera_images import LabelledImage
 
 # of KITTI's resolution, at which the detector looks at its images
@@ -25,18 +26,21 @@ def camera(
     ),
     split: Annotated[str, typer.Option(help="file of ROOT/ImageSets")] = "train",
     masks: Annotated[bool, typer.Option(help="learn instance masks; a KITTI folder has none")] = True,
-    frames: Annotated[int, typer.Option(min=2, help="simulated images")] = 700,
+    frames: Annotated[int, typer.Option(min=2, help="simulated images")] = 510,
     samples_seed: Annotated[int, typer.Option(min=0, help="of the simulated images")] = 1002,
     samples: Annotated[Path | None, typer.Option(help="folder of simulated images; default: the user's cache")] = None,
     jobs: Annotated[int, typer.Option(min=1, help="processes that simulate")] = 1,
-    held_out: Annotated[int, typer.Option(min=1, help="images at the end to measure and calibrate with")] = 100,
-    steps: Annotated[int, typer.Option(min=1)] = 3600,
+    held_out: Annotated[int, typer.Option(min=1, help="images at the end to measure and calibrate with")] = 50,
+    steps: Annotated[int, typer.Option(min=1, help="batches of the whole training")] = 2600,
     batch_size: Annotated[int, typer.Option(min=1, help="views a step, 192 x 416 pixels each")] = 8,
     learning_rate: Annotated[float, typer.Option(help="highest one of the schedule")] = 3e-3,
     seed: Annotated[int, typer.Option(min=0, help="of weights and batches")] = 0,
-    checkpoint_every: Annotated[int, typer.Option(min=1, help="steps between checkpoints and validations")] = 600,
+    checkpoint_every: Annotated[int, typer.Option(min=1, help="steps between checkpoints and validations")] = 650,
     workers: Annotated[int, typer.Option(min=0, help="processes that prepare batches")] = 0,
     threads: Annotated[int, typer.Option(min=0, help="threads of torch; 0 leaves it to torch")] = 0,
+    init: Annotated[
+        Path | None, typer.Option(help="last.pt of another training, whose weights this one begins with")
+    ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="go on from the folder's last checkpoint")] = False,
 ) -> None:
     """Train the small camera detector (Car, Pedestrian, Cyclist) and write it as camera.onnx.
@@ -45,14 +49,11 @@ def camera(
 
     lcf3d train camera --out train-camera
 
-    lcf3d train camera kitti:KITTI --split train --no-masks --out train-camera-kitti
+    lcf3d train camera kitti:KITTI --split train --no-masks --steps 20000 --out train-camera-kitti
     """
     from lcf3d.cli.train_common import train_with_progress
-    from lcf3d.detectors.camera.small_export import export_small
     from lcf3d.detectors.camera.small_network import SmallConfig
-    from lcf3d.formats.files import write_json
     from lcf3d.training.camera import CameraTask
-    from lcf3d.training.camera_calibration import calibrate
     from lcf3d.training.loop import TrainingSettings, import_torch
 
     torch = import_torch()
@@ -71,7 +72,16 @@ def camera(
     settings = TrainingSettings(
         steps, learning_rate, seed=seed, average=0.998, checkpoint_every=checkpoint_every, workers=workers
     )
-    network = train_with_progress(task, settings, out, resume)
+    network = train_with_progress(task, settings, out, resume, init)
+    _finish(task, network, out)
+
+
+def _finish(task: CameraTask, network: Any, out: Path) -> None:
+    """Calibrate the network's scores, write it with its figures, and say where it is."""
+    from lcf3d.detectors.camera.small_export import export_small
+    from lcf3d.formats.files import write_json
+    from lcf3d.training.camera_calibration import calibrate
+
     calibrate(network, task.held_out)
     export_small(network, out / "camera.onnx")
     figures = task.validate(network)
