@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import typer
 
+from lcf3d.cli.train_camera import camera
+from lcf3d.cli.train_lidar import lidar
 from lcf3d.cli.train_localizer import localizer
 
 train = typer.Typer(
@@ -12,4 +14,5 @@ train = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )
-train.command("localizer")(localizer)
+for verb in (localizer, lidar, camera):
+    train.command(verb.__name__)(verb)
