@@ -10,7 +10,7 @@ from lcf3d.cli.train_localizer import localizer
 
 train = typer.Typer(
     name="train",
-    help="Train the small networks: localizer, LiDAR detector, camera detector (needs pip install 'lcf3d[train]').",
+    help="Train the small networks: localizer, LiDAR detector, camera detector (needs the extra 'train').",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )
