@@ -53,7 +53,7 @@ def test_an_interrupted_training_ends_like_one_that_was_not(trained, tmp_path):
 
 def test_it_learns_one_scan_by_heart(tmp_path):
     only = ScanSource(lambda i: scene(0, 3), 1, 0.0)
-    calm = replace(TASK.augmentation, scale=0, tilt=0, drop=0, intensity_gain=0, intensity_offset=0, intensity_noise=0)
+    calm = replace(TASK.augmentation, scale=0, drop=0, intensity_gain=0, intensity_offset=0, intensity_noise=0)
     task = LidarTask(only, None, CONFIG, 1, (64, 64), 1, calm)
     losses = []
     settings = TrainingSettings(steps=30, learning_rate=4e-3, checkpoint_every=30, average=0)

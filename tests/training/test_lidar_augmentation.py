@@ -44,6 +44,12 @@ def test_tilted_ground_carries_the_boxes():
     np.testing.assert_allclose(moved[:, 2], 0.01 * scan.boxes[:, 1] - 0.02 * scan.boxes[:, 0] + 0.1)
     assert (moved[:, [0, 1, 3, 4, 5, 6]] == 0).all()
     assert (bright_in(scan) >= 36).all()
+    heights = [
+        augment(scene(0), AROUND, 0.0, None, AugmentationSettings(tilt=tilt, scale=0), np.random.default_rng(1)).boxes
+        for tilt in (0.0, 0.01)
+    ]
+    assert np.ptp(heights[0][:, 2] - heights[0][:, 5] / 2) < 1e-9
+    assert np.ptp(heights[1][:, 2] - heights[1][:, 5] / 2) > 0.01
 
 
 def test_turning_back_gives_the_scan():
@@ -74,7 +80,7 @@ def test_the_same_generator_gives_the_same_scan():
 
 def test_pasted_objects_have_room_and_their_points():
     objects = collect_objects(SCENES, 3, 10)
-    quiet = AugmentationSettings(drop=0, scale=0, tilt=0, intensity_gain=0, intensity_offset=0, intensity_noise=0)
+    quiet = AugmentationSettings(drop=0, scale=0, intensity_gain=0, intensity_offset=0, intensity_noise=0)
     added = 0
     for seed in range(8):
         rng = np.random.default_rng(seed)

@@ -34,7 +34,7 @@ def lidar(
     steps: Annotated[int, typer.Option(min=1)] = 3600,
     batch_size: Annotated[int, typer.Option(min=1, help="windows a step, 36 m x 38 m each, two of a scan")] = 4,
     learning_rate: Annotated[float, typer.Option(help="highest one of the schedule")] = 3e-3,
-    tilt: Annotated[float, typer.Option(min=0, help="degrees that scans are tilted by at most")] = 0.6,
+    tilt: Annotated[float, typer.Option(min=0, help="degrees that scans are tilted by at most")] = 0.0,
     start: Annotated[Path | None, typer.Option(help="last.pt of another training to begin with")] = None,
     seed: Annotated[int, typer.Option(min=0, help="of weights and batches")] = 0,
     checkpoint_every: Annotated[int, typer.Option(min=1, help="steps between checkpoints and validations")] = 500,

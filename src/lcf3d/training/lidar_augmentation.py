@@ -38,7 +38,7 @@ class AugmentationSettings:
         angles: a turned scan shows one part of its surroundings; the best of so many random ones is taken.
         scale: largest relative change of size.
         tilt: largest roll and pitch in radians; a scan is also raised or lowered, by as much as such a tilt does
-            `TILT_REACH_M` away. Roads are not flat, and the height of a box must come from its points.
+            `TILT_REACH_M` away, so that the height of a box must come from its points; 0 for flat ground.
         drop: largest share of the points that is left out.
         intensity_gain: largest relative change of all intensities of a scan.
         intensity_offset: largest value that is added to all of them.
@@ -49,7 +49,7 @@ class AugmentationSettings:
 
     angles: int = 3
     scale: float = 0.05
-    tilt: float = 0.01
+    tilt: float = 0.0
     drop: float = 0.3
     intensity_gain: float = 0.4
     intensity_offset: float = 0.1
@@ -120,8 +120,9 @@ def augment(
     if objects is not None:
         scan = _paste(scan, area, objects, settings, rng)
     scan = scaled(scan, float(rng.uniform(1 - settings.scale, 1 + settings.scale)))
-    roll, pitch, heave = rng.uniform(-settings.tilt, settings.tilt, 3)
-    scan = tilted(scan, roll, pitch, heave * TILT_REACH_M)
+    if settings.tilt > 0:
+        roll, pitch, heave = rng.uniform(-settings.tilt, settings.tilt, 3)
+        scan = tilted(scan, roll, pitch, heave * TILT_REACH_M)
     kept = rng.random(len(scan.points)) >= rng.uniform(0, settings.drop)
     points = scan.points[kept]
     gain = rng.uniform(1 - settings.intensity_gain, 1 + settings.intensity_gain)
