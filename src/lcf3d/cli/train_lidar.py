@@ -35,7 +35,9 @@ def lidar(
     batch_size: Annotated[int, typer.Option(min=1, help="windows a step, 36 m x 38 m each, two of a scan")] = 4,
     learning_rate: Annotated[float, typer.Option(help="highest one of the schedule")] = 3e-3,
     tilt: Annotated[float, typer.Option(min=0, help="degrees that scans are tilted by at most")] = 0.0,
-    start: Annotated[Path | None, typer.Option(help="last.pt of another training to begin with")] = None,
+    init: Annotated[
+        Path | None, typer.Option(help="last.pt of another training, whose weights this one begins with")
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, help="of weights and batches")] = 0,
     checkpoint_every: Annotated[int, typer.Option(min=1, help="steps between checkpoints and validations")] = 500,
     workers: Annotated[int, typer.Option(min=0, help="processes that prepare batches")] = 0,
@@ -48,7 +50,7 @@ def lidar(
 
     lcf3d train lidar --out train-lidar
 
-    lcf3d train lidar kitti:KITTI --split train --start train-lidar/last.pt --out train-lidar-kitti
+    lcf3d train lidar kitti:KITTI --split train --init train-lidar/last.pt --out train-lidar-kitti
     """
     from lcf3d.cli.train_common import train_with_progress
     from lcf3d.detectors.lidar.presets import COMPACT_KITTI
@@ -68,7 +70,7 @@ def lidar(
         batch_size=batch_size,
         augmentation=AugmentationSettings(tilt=math.radians(tilt)),
         objects=objects,
-        start=start,
+        start=init,
     )
     settings = TrainingSettings(
         steps, learning_rate, seed=seed, average=0.998, checkpoint_every=checkpoint_every, workers=workers
