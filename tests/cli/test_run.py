@@ -9,6 +9,8 @@ from lcf3d.errors import Lcf3dError
 from lcf3d.formats.kitti import objects_from_detections_2d, read_objects, write_objects
 from lcf3d.formats.run_folder import RunFolder
 from lcf3d.geometry.camera import project_boxes
+from lcf3d.localizers.named import SHIPPED
+from lcf3d.provenance import Stage
 from lcf3d.structures import KITTI_CLASSES, Detections2D
 from tests.datasets.kitti_folder import LABELS, make_kitti, make_results
 
@@ -228,3 +230,20 @@ def test_scores_without_bounds_are_calibrated_against_the_camera(paths):
     assert (fused.detections.scores <= 1).all()
     with pytest.raises(Lcf3dError, match="scores must lie in"):
         run(paths, "--overwrite", "--calibration", "none")
+
+
+def test_the_localizer_can_be_chosen(paths, tmp_path):
+    recovered = {}
+    for name in ("geometric", "network", f"onnx:{SHIPPED['kitti']}"):
+        out = tmp_path / name.partition(":")[0]
+        jobs = ("--jobs", "2") if name.startswith("onnx") else ()
+        run({**paths, "out": out}, "--localizer", name, "--set", "min_quality=0", "--set", "confirm_iou=0", *jobs)
+        assert json.loads((out / "run.json").read_text())["localizer"] == name
+        recovered[name] = RunFolder(out).read("000000")
+    boxes = [fused.detections.boxes[fused.stages == Stage.RECOVERED] for fused in recovered.values()]
+    assert [len(b) for b in boxes] == [1, 1, 1]
+    assert np.abs(boxes[0] - boxes[1]).max() > 1e-6
+    np.testing.assert_allclose(boxes[1], boxes[2], atol=1e-5)
+    with pytest.raises(Lcf3dError, match="unknown localizer 'best'"):
+        run({**paths, "out": tmp_path / "none"}, "--localizer", "best")
+    assert not (tmp_path / "none").exists()

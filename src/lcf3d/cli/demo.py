@@ -8,66 +8,91 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
+    from rich.table import Table
+
     from lcf3d.demo.drive import DemoResult
 
 
 def demo(
     out: Annotated[Path, typer.Option(help="folder for the pictures")] = Path("lcf3d-demo"),
     frames: Annotated[int, typer.Option(min=1, max=20, help="frames to drive")] = 20,
-    seed: Annotated[int, typer.Option(min=0, help="of the detectors' noise, misses and false alarms")] = 0,
+    view: Annotated[bool, typer.Option("--view", help="open the animation when done")] = False,
     json_: Annotated[bool, typer.Option("--json", help="print the figures as JSON")] = False,
 ) -> None:
-    """Drive along a simulated street, fuse a camera with a LiDAR, compare with the LiDAR alone.
+    """Drive along a simulated street with two small networks, fuse them, compare with the LiDAR alone.
 
-    Images, scans and labels come with the package (made by lcf3d simulate). The detectors are made from the labels
-    with noise, misses and false alarms: the figures show what the fusion does, not how good any detector is.
+    Images, scans, labels and both networks come with the package; the networks were trained on other simulated
+    streets (lcf3d train lidar, lcf3d train camera), not on this one.
     """
     import json
 
+    from rich.console import Console
     from rich.progress import Progress
 
-    from lcf3d.demo.drive import demo_frames, run_demo, write_pictures
+    from lcf3d.demo.drive import drive, measure, shipped_detectors, write_pictures
 
-    with Progress(disable=json_) as progress:
-        driven = list(progress.track(demo_frames(frames, seed), total=frames, description="driving "))
-        task = progress.add_task("fusing  ", total=None)
-        result = run_demo(driven)
+    with Progress(disable=json_, console=Console(stderr=True)) as progress:
+        detectors = shipped_detectors()
+        driven = list(progress.track(drive(detectors, frames), total=frames, description="driving  "))
+        task = progress.add_task("measuring", total=None)
+        result = measure(driven)
         progress.update(task, total=1, completed=1)
-        task = progress.add_task("drawing ", total=None)
-        paths = write_pictures(result, out)
+        task = progress.add_task("drawing  ", total=None)
+        paths = write_pictures(driven, out)
         progress.update(task, total=1, completed=1)
     if json_:
-        figures = {name: metrics.to_json() for name, metrics in result.metrics.items()}
-        typer.echo(json.dumps({"fusion_ms": result.fusion_ms, "variants": figures}, indent=2))
+        variants = {
+            name: {**metrics.to_json(), "fusion_ms": result.fusion_ms.get(name)}
+            for name, metrics in result.metrics.items()
+        }
+        figures = {"stage_ms": result.stage_ms, "frames_per_second": result.frames_per_second, "variants": variants}
+        typer.echo(json.dumps(figures, indent=2))
     else:
         _print(result, paths)
+    if view:
+        typer.launch(str(paths[-1]))
 
 
 def _print(result: DemoResult, paths: list[Path]) -> None:
     from rich.console import Console
-    from rich.table import Table
 
-    first = next(iter(result.metrics.values()))
-    table = Table(title=f"{len(result.frames)} frames: average precision by class (centre distance 0.5 to 4 m)")
-    table.add_column("")
-    for name in first.class_names:
-        table.add_column(name, justify="right")
-    table.add_column("mAP", justify="right")
-    table.add_column("NDS^", justify="right")
-    for variant, metrics in result.metrics.items():
-        by_class = metrics.aps.mean(axis=1)
-        table.add_row(
-            variant, *(f"{100 * ap:.1f}" for ap in by_class), f"{100 * metrics.mean_ap:.1f}", f"{metrics.nds_hat:.3f}"
-        )
     console = Console()
-    console.print(table)
+    console.print(_table(result))
     console.print(
-        "paper: what the camera does not confirm is deleted. kitti: it is weighed, see docs/when-fusion-helps.md"
+        "matching: what the camera does not confirm is deleted (paper). weighed: it is doubted, see "
+        "docs/when-fusion-helps.md",
+        soft_wrap=True,
     )
-    console.print(f"\nfusion: {result.fusion_ms:.1f} ms a frame (median). Some of its decisions:")
+    stages = ", ".join(f"{name} {value:.0f} ms" for name, value in result.stage_ms.items() if name != "frame")
+    console.print(
+        f"\nmedian of a frame: {stages}: {result.frames_per_second:.1f} frames a second. Some decisions:",
+        soft_wrap=True,
+    )
     for sentence in _examples(result):
         console.print(f"  {sentence}", soft_wrap=True)
     console.print(f"\npictures: {paths[0].parent}/ (frame by frame, and {paths[-1].name})", soft_wrap=True)
+
+
+def _table(result: DemoResult) -> Table:
+    """One row a variant: AP by class, means, milliseconds."""
+    from rich.box import SIMPLE
+    from rich.table import Table
+
+    first = next(iter(result.metrics.values()))
+    title = f"{len(result.frames)} frames: average precision (centre distance 0.5 to 4 m), fusion time"
+    table = Table(title=title, box=SIMPLE, padding=(0, 1), pad_edge=False)
+    for heading in ("", *first.class_names, "mAP", "NDS^", "ms"):
+        table.add_column(heading, justify="right" if heading else "left", no_wrap=True)
+    for variant, metrics in result.metrics.items():
+        spent = result.fusion_ms.get(variant)
+        table.add_row(
+            variant,
+            *(f"{100 * ap:.1f}" for ap in metrics.aps.mean(axis=1)),
+            f"{100 * metrics.mean_ap:.1f}",
+            f"{metrics.nds_hat:.3f}",
+            "" if spent is None else f"{spent:.1f}",
+        )
+    return table
 
 
 def _examples(result: DemoResult) -> list[str]:
@@ -76,8 +101,7 @@ def _examples(result: DemoResult) -> list[str]:
 
     from lcf3d.provenance import Stage
 
-    fused = max(result.fused, key=lambda f: int((f.stages == Stage.RECOVERED).sum()))
-    name = result.frames[result.fused.index(fused)].frame.id
+    item = max(result.frames, key=lambda f: int((f.fused.stages == Stage.RECOVERED).sum()))
     stages = (Stage.MATCHED, Stage.RECOVERED, Stage.KEPT)
-    chosen = [int(i) for stage in stages for i in np.flatnonzero(fused.stages == stage)[:2]]
-    return [f"frame {name}: {fused.explain(i)}" for i in chosen]
+    chosen = [int(i) for stage in stages for i in np.flatnonzero(item.fused.stages == stage)[:2]]
+    return [f"frame {item.frame.id}: {item.fused.explain(i)}" for i in chosen]

@@ -1,54 +1,161 @@
-"""The whole demonstration: frames, fusion variants, metrics, pictures."""
+"""The whole demonstration: frames, both networks, the paper's ablation, metrics, pictures."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
-from lcf3d.demo.detectors import camera_detections, ground_truth, lidar_detections
-from lcf3d.demo.shipped import read_drive
+from lcf3d.demo.shipped import ShippedFrame, read_drive
+from lcf3d.detectors.base import CameraDetector, LidarDetector
+from lcf3d.detectors.specs import load_detector
 from lcf3d.evaluation.generalization import GeneralizationMetrics, evaluate_generalization
 from lcf3d.fusion.clustering import cluster_boxes
 from lcf3d.fusion.config import FusionConfig
 from lcf3d.fusion.pipeline import LateCascadeFusion
+from lcf3d.geometry.boxes import points_in_boxes
 from lcf3d.geometry.camera import project_boxes
+from lcf3d.localizers.named import default_localizer
 from lcf3d.provenance import FusedDetections
-from lcf3d.structures import Detections2D, Detections3D, Frame
+from lcf3d.structures import KITTI_CLASSES, Detections2D, Detections3D, Frame
 
 FRAMES = 20
+CLASS_OF = {"Car": "Car", "Van": "Car", "Pedestrian": "Pedestrian", "Cyclist": "Cyclist"}
+"""What the networks were taught to call the labelled things."""
+LEAST_POINTS = 5
+DRAWN_SCORE = 0.15
+"""Boxes of a lower score are not drawn."""
+LIDAR_ALONE = "LiDAR alone"
+FULL = "all, weighed (kitti preset)"
+_FILTER: dict[str, Any] = {"unmatched": "drop", "ensemble": "none", "recovery": False}
+VARIANTS: dict[str, dict[str, Any]] = {
+    "matching": _FILTER,
+    "matching, recovery": {**_FILTER, "recovery": True},
+    "matching, recovery, semantics": {**_FILTER, "recovery": True, "ensemble": "probabilistic"},
+    FULL: {},
+}
+"""Rows of the table: changes to the preset ``kitti``. The first three are the paper's filter (its module ablation)."""
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Detectors:
+    """The two branches."""
+
+    lidar: LidarDetector
+    camera: CameraDetector
 
 
 @dataclass(frozen=True, eq=False)
 class DemoFrame:
-    """One moment of the drive with what the detectors say of it.
+    """One moment of the drive with what the networks say of it.
 
     Attributes:
         frame: scan, image, camera and ground truth: labelled objects with at least five returns.
         lidar: 3D detections without non-maximum suppression.
         camera: 2D detections by camera name.
+        fused: of the full fusion.
+        milliseconds: ``LiDAR network``, ``camera network``, ``both at once``, ``fusion``, ``frame``.
     """
 
     frame: Frame
     lidar: Detections3D
     camera: dict[str, Detections2D]
+    fused: FusedDetections
+    milliseconds: dict[str, float]
 
 
-def demo_frames(count: int = FRAMES, seed: int = 0) -> Iterator[DemoFrame]:
-    """The first ``count`` frames of the shipped drive; ``seed`` is that of the detectors' faults.
+@dataclass(frozen=True, eq=False)
+class DemoResult:
+    """What came out.
+
+    Attributes:
+        frames: the frames of the drive.
+        metrics: by variant, `LIDAR_ALONE` first.
+        fusion_ms: median milliseconds of the fusion by variant.
+        stage_ms: median milliseconds by stage, see `DemoFrame`.
+    """
+
+    frames: list[DemoFrame]
+    metrics: dict[str, GeneralizationMetrics]
+    fusion_ms: dict[str, float]
+    stage_ms: dict[str, float]
+
+    @property
+    def frames_per_second(self) -> float:
+        """Frames that the loop handles in a second: both networks and the full fusion."""
+        return 1000 / self.stage_ms["frame"]
+
+
+def shipped_detectors() -> Detectors:
+    """The networks that come with lcf3d, one thread each: they run at the same time.
+
+    Raises:
+        DetectorError: a file of the package is missing.
+    """
+    return Detectors(
+        load_detector("shipped:kitti?threads=1", "lidar", KITTI_CLASSES),
+        load_detector("shipped:kitti?threads=1", "camera", KITTI_CLASSES),
+    )
+
+
+def ground_truth(frame: ShippedFrame) -> Detections3D:
+    """Labelled objects with at least `LEAST_POINTS` returns; all are in view of the camera."""
+    names = [CLASS_OF.get(str(name), "") for name in frame.objects.class_names]
+    rows = np.flatnonzero(np.isin(names, KITTI_CLASSES))
+    boxes = frame.objects.boxes[rows]
+    labels = np.array([KITTI_CLASSES.index(names[row]) for row in rows], dtype=np.int64)
+    seen = points_in_boxes(frame.points, boxes).sum(axis=1) >= LEAST_POINTS
+    return Detections3D(boxes[seen], np.ones(int(seen.sum())), labels[seen], KITTI_CLASSES)
+
+
+def drive(detectors: Detectors, count: int = FRAMES) -> Iterator[DemoFrame]:
+    """The first ``count`` frames of the shipped drive through both networks, at the same time, and the fusion.
 
     Raises:
         FormatError: the shipped archive is damaged.
     """
-    for index, shipped in enumerate(read_drive(count=count)):
-        rng = np.random.default_rng([seed, index])
-        name = shipped.camera.name
-        frame = Frame(shipped.id, shipped.points, (shipped.camera,), {name: shipped.image}, ground_truth(shipped))
-        yield DemoFrame(frame, lidar_detections(shipped, rng), {name: camera_detections(shipped, rng)})
+    shipped = read_drive(count=count)
+    fusion = LateCascadeFusion(FusionConfig.preset("kitti"), default_localizer())
+    with ThreadPoolExecutor(2) as pool:
+        _detect(detectors, shipped[0], pool)  # compiles or loads what it needs
+        for number, item in enumerate(shipped):
+            started = time.perf_counter()
+            lidar, camera, spent = _detect(detectors, item, pool)
+            name = item.camera.name
+            frame = Frame(item.id, item.points, (item.camera,), {name: item.image}, ground_truth(item))
+            if number == 0:
+                fusion(frame, lidar, {name: camera})
+                started = time.perf_counter() - spent["both at once"] / 1e3
+            fused, milliseconds = _timed(partial(fusion, frame, lidar, {name: camera}))
+            spent |= {"fusion": milliseconds, "frame": (time.perf_counter() - started) * 1e3}
+            yield DemoFrame(frame, lidar, {name: camera}, fused, spent)
+
+
+def _detect(
+    detectors: Detectors, item: ShippedFrame, pool: ThreadPoolExecutor
+) -> tuple[Detections3D, Detections2D, dict[str, float]]:
+    """Detections of both networks in parallel threads, and milliseconds."""
+    started = time.perf_counter()
+    lidar = pool.submit(_timed, lambda: detectors.lidar(item.points))
+    camera = pool.submit(_timed, lambda: detectors.camera([item.image])[0])
+    (boxes, lidar_ms), (found, camera_ms) = lidar.result(), camera.result()
+    both = (time.perf_counter() - started) * 1e3
+    return boxes, found, {"LiDAR network": lidar_ms, "camera network": camera_ms, "both at once": both}
+
+
+def _timed(call: Callable[[], T]) -> tuple[T, float]:
+    """A result and the milliseconds that it took."""
+    started = time.perf_counter()
+    result = call()
+    return result, (time.perf_counter() - started) * 1e3
 
 
 def lidar_alone(lidar: Detections3D, views: Sequence[Any]) -> Detections3D:
@@ -58,59 +165,32 @@ def lidar_alone(lidar: Detections3D, views: Sequence[Any]) -> Detections3D:
     return lidar[kept[seen]]
 
 
-@dataclass(frozen=True, eq=False)
-class DemoResult:
-    """What came out.
-
-    Attributes:
-        frames: the frames of the drive.
-        fused: the full fusion's result on each.
-        metrics: by variant: ``LiDAR alone``, then the presets ``paper`` and ``kitti`` without and with recovery.
-        fusion_ms: median milliseconds of the full fusion a frame.
-    """
-
-    frames: list[DemoFrame]
-    fused: list[FusedDetections]
-    metrics: dict[str, GeneralizationMetrics]
-    fusion_ms: float
-
-
-def fuse_all(preset: str, recovery: bool, frames: Sequence[DemoFrame]) -> list[FusedDetections]:
-    """All frames fused with the settings of a preset."""
-    fusion = LateCascadeFusion(FusionConfig.preset(preset).updated(recovery=recovery))
-    return [fusion(item.frame, item.lidar, item.camera) for item in frames]
-
-
-def run_demo(frames: list[DemoFrame]) -> DemoResult:
-    """Fuse and evaluate the frames of the drive."""
-    full = LateCascadeFusion(FusionConfig.preset("kitti"))
-    fused, times = [], []
-    full(frames[0].frame, frames[0].lidar, frames[0].camera)  # compiles or loads what it needs
-    for item in frames:
-        start = time.perf_counter()
-        fused.append(full(item.frame, item.lidar, item.camera))
-        times.append((time.perf_counter() - start) * 1e3)
-    variants = {"LiDAR alone": [lidar_alone(item.lidar, item.frame.cameras) for item in frames]}
-    for preset in ("paper", "kitti"):
-        variants[f"{preset}: matching"] = [f.detections for f in fuse_all(preset, False, frames)]
-        recovered = fused if preset == "kitti" else fuse_all(preset, True, frames)
-        variants[f"{preset}: matching + recovery"] = [f.detections for f in recovered]
+def measure(frames: list[DemoFrame]) -> DemoResult:
+    """Fuse the frames of the drive by all variants, and evaluate them."""
+    found = {LIDAR_ALONE: [lidar_alone(item.lidar, item.frame.cameras) for item in frames]}
+    milliseconds: dict[str, float] = {}
+    for name, changes in VARIANTS.items():
+        fusion = LateCascadeFusion(FusionConfig.preset("kitti").updated(**changes), default_localizer())
+        timed = [_timed(partial(fusion, item.frame, item.lidar, item.camera)) for item in frames]
+        found[name] = [fused.detections for fused, _ in timed]
+        milliseconds[name] = float(np.median([spent for _, spent in timed]))
     truth = [item.frame.labels for item in frames]
     metrics = {
-        name: evaluate_generalization([t for t in truth if t is not None], found) for name, found in variants.items()
+        name: evaluate_generalization([t for t in truth if t is not None], results) for name, results in found.items()
     }
-    return DemoResult(frames, fused, metrics, sorted(times)[len(times) // 2])
+    stages = {name: float(np.median([f.milliseconds[name] for f in frames])) for name in frames[0].milliseconds}
+    return DemoResult(frames, metrics, milliseconds, stages)
 
 
-def write_pictures(result: DemoResult, folder: Path) -> list[Path]:
+def write_pictures(frames: Sequence[DemoFrame], folder: Path) -> list[Path]:
     """One PNG a frame and an animation; gives the paths written."""
     from lcf3d.formats.files import atomic_path
     from lcf3d.visualization.png import draw_frame, save_png
     from lcf3d.visualization.scene import Scene
 
     pictures, paths = [], []
-    for item, fused in zip(result.frames, result.fused, strict=True):
-        picture = draw_frame(item.frame, Scene.from_fused(fused, item.frame.labels))
+    for item in frames:
+        picture = draw_frame(item.frame, Scene.from_fused(item.fused, item.frame.labels, DRAWN_SCORE))
         paths.append(folder / f"{item.frame.id}.png")
         save_png(picture, paths[-1])
         pictures.append(picture.resize((picture.width // 2, picture.height // 2)))

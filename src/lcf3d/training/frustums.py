@@ -16,7 +16,7 @@ from lcf3d.datasets.opening import parse_dataset
 from lcf3d.errors import DatasetError
 from lcf3d.formats.kitti import read_objects
 from lcf3d.fusion.frustum import enlarge_boxes, points_in_image_boxes
-from lcf3d.geometry.boxes import YAW, lidar_from_kitti, points_in_boxes
+from lcf3d.geometry.boxes import lidar_from_kitti, points_in_boxes, transform_boxes
 from lcf3d.geometry.camera import NEAR, project_boxes, project_points
 from lcf3d.geometry.iou import image_iou
 from lcf3d.structures import BoolArray, Camera, Detections3D, FloatArray, IntArray
@@ -88,13 +88,11 @@ class PooledFrustum:
 
 def turned_scene(scene: LabelledScene, angle: float) -> LabelledScene:
     """The same street with the car turned by an angle about the vertical axis; 2D annotations are left behind."""
-    cos, sin = np.cos(angle), np.sin(angle)
-    rotation = np.array([[cos, -sin], [sin, cos]])
+    rotation = np.eye(4)
+    rotation[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
     points = scene.points.copy()
-    points[:, :2] = (scene.points[:, :2] @ rotation.T).astype(np.float32)
-    boxes = scene.boxes.copy()
-    boxes[:, :2] = scene.boxes[:, :2] @ rotation.T
-    boxes[:, YAW] += angle
+    points[:, :2] = (scene.points[:, :2] @ rotation[:2, :2].T).astype(np.float32)
+    boxes = transform_boxes(scene.boxes, rotation)
     return LabelledScene(points, boxes, scene.names, scene.camera, scene.right)
 
 
