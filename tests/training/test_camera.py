@@ -110,6 +110,7 @@ def test_the_command_trains_and_exports(tmp_path: Path, monkeypatch: pytest.Monk
     from lcf3d.detectors.camera.onnx import OnnxDetector
 
     monkeypatch.setattr(train_camera, "_simulated_images", lambda *_: list(IMAGES))
+    monkeypatch.setattr("lcf3d.detectors.camera.small_network.SmallConfig", lambda: TINY)
     app = typer.Typer()
     app.command()(train_camera.camera)
     arguments = ["--out", str(tmp_path), "--steps", "1", "--batch-size", "1", "--held-out", "1"]
