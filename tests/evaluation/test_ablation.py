@@ -58,3 +58,10 @@ def test_json_has_no_nan(rows):
     values = rows[MODULES, "none: LiDAR alone"].to_json()
     assert values["ap"]["Pedestrian"] == [None, None, None]
     assert values["ap"]["Car"][0] > 0
+
+
+def test_lidar_alone_is_measured_after_suppression_where_that_is_asked():
+    boxes = np.array([[10.0, 0, 0, 4, 1.6, 1.5, 0], [10.2, 0, 0, 4, 1.6, 1.5, 0], [30, 0, 0, 4, 1.6, 1.5, 0]])
+    found = Detections3D(boxes, np.array([0.4, 0.9, 0.3]), np.zeros(3, np.int64), KITTI_CLASSES)
+    kept = suppressed(found)
+    np.testing.assert_array_equal(np.sort(kept.scores), [0.3, 0.9])

@@ -54,10 +54,10 @@ def ablate(
     request = RunRequest(
         dataset, lidar, {"left": camera}, split, config=config, changes=tuple(set_ or ()), tiles=tiles, missing=missing
     )
-    inputs, truth, settings = _read(request)
+    inputs, truth, settings, suppress = _read(request)
     scores = _calibration(calibration, inputs, settings)
     chosen, progress = load_localizer(localizer), plain if json_ else tracked
-    rows = measure(inputs, truth, settings, scores, chosen, progress)
+    rows = measure(inputs, truth, settings, scores, chosen, progress, suppress)
     scans = all(item.frame.points is not None for item in inputs)
     if json_:
         typer.echo(json.dumps({"frames": len(inputs), "scans": scans, "rows": [r.to_json() for r in rows]}, indent=2))
@@ -68,10 +68,11 @@ def ablate(
         console.print("not every frame has a LiDAR scan: rows with detection recovery are left out", soft_wrap=True)
 
 
-def _read(request: RunRequest) -> tuple[list[AblationInput], KittiFrames, FusionConfig]:
-    """Frames with their detections, the labels, and the settings."""
+def _read(request: RunRequest) -> tuple[list[AblationInput], KittiFrames, FusionConfig, bool]:
+    """Frames with their detections, the labels, the settings, and whether a LiDAR network ran here without NMS."""
     from lcf3d.cli.run_setup import read_inputs
     from lcf3d.datasets.kitti import KittiDataset
+    from lcf3d.detectors.sources import LidarOnScans
     from lcf3d.evaluation.ablation import AblationInput
     from lcf3d.formats.kitti import read_folder
 
@@ -85,7 +86,7 @@ def _read(request: RunRequest) -> tuple[list[AblationInput], KittiFrames, Fusion
         if not camera.sees(frame, "left"):
             raise DatasetError(f"frame {frame.id} has no left image; pass results:DIR as the camera branch")
         inputs.append(AblationInput(frame, found.lidar.detect(frame), camera.detect(frame, "left")))
-    return inputs, truth, found.config
+    return inputs, truth, found.config, isinstance(found.lidar, LidarOnScans)
 
 
 def _calibration(text: str, inputs: Sequence[AblationInput], settings: FusionConfig) -> Calibration | None:

@@ -80,7 +80,7 @@ def _table(result: DemoResult) -> Table:
 
     first = next(iter(result.metrics.values()))
     title = f"{len(result.frames)} frames: average precision (centre distance 0.5 to 4 m), fusion time"
-    table = Table(title=title, box=SIMPLE, padding=(0, 1), pad_edge=False)
+    table = Table(title=title, box=SIMPLE, padding=(0, 1, 0, 0), pad_edge=False)
     for heading in ("", *first.class_names, "mAP", "NDS^", "ms"):
         table.add_column(heading, justify="right" if heading else "left", no_wrap=True)
     for variant, metrics in result.metrics.items():

@@ -15,13 +15,13 @@ import numpy as np
 from lcf3d.demo.shipped import ShippedFrame, read_drive
 from lcf3d.detectors.base import CameraDetector, LidarDetector
 from lcf3d.detectors.specs import load_detector
+from lcf3d.evaluation.ablation import suppressed
 from lcf3d.evaluation.generalization import GeneralizationMetrics, evaluate_generalization
-from lcf3d.fusion.clustering import cluster_boxes
 from lcf3d.fusion.config import FusionConfig
 from lcf3d.fusion.pipeline import LateCascadeFusion
 from lcf3d.geometry.boxes import points_in_boxes
 from lcf3d.geometry.camera import project_boxes
-from lcf3d.localizers.named import default_localizer
+from lcf3d.localizers.named import ShippedLocalizer
 from lcf3d.provenance import FusedDetections
 from lcf3d.structures import KITTI_CLASSES, Detections2D, Detections3D, Frame
 
@@ -29,7 +29,7 @@ FRAMES = 20
 CLASS_OF = {"Car": "Car", "Van": "Car", "Pedestrian": "Pedestrian", "Cyclist": "Cyclist"}
 """What the networks were taught to call the labelled things."""
 LEAST_POINTS = 5
-DRAWN_SCORE = 0.15
+DRAWN_SCORE = 0.2
 """Boxes of a lower score are not drawn."""
 LIDAR_ALONE = "LiDAR alone"
 FULL = "all, weighed (kitti preset)"
@@ -123,7 +123,7 @@ def drive(detectors: Detectors, count: int = FRAMES) -> Iterator[DemoFrame]:
         FormatError: the shipped archive is damaged.
     """
     shipped = read_drive(count=count)
-    fusion = LateCascadeFusion(FusionConfig.preset("kitti"), default_localizer())
+    fusion = LateCascadeFusion(FusionConfig.preset("kitti"), ShippedLocalizer())
     with ThreadPoolExecutor(2) as pool:
         _detect(detectors, shipped[0], pool)  # compiles or loads what it needs
         for number, item in enumerate(shipped):
@@ -160,9 +160,8 @@ def _timed(call: Callable[[], T]) -> tuple[T, float]:
 
 def lidar_alone(lidar: Detections3D, views: Sequence[Any]) -> Detections3D:
     """What a LiDAR detector gives by itself: after suppression, in view of a camera, as the ground truth is."""
-    kept = cluster_boxes(lidar.boxes, lidar.scores, lidar.labels, method="nms").representative
-    seen = np.any([project_boxes(lidar.boxes[kept], view)[1] for view in views], axis=0)
-    return lidar[kept[seen]]
+    kept = suppressed(lidar)
+    return kept[np.any([project_boxes(kept.boxes, view)[1] for view in views], axis=0)]
 
 
 def measure(frames: list[DemoFrame]) -> DemoResult:
@@ -170,7 +169,7 @@ def measure(frames: list[DemoFrame]) -> DemoResult:
     found = {LIDAR_ALONE: [lidar_alone(item.lidar, item.frame.cameras) for item in frames]}
     milliseconds: dict[str, float] = {}
     for name, changes in VARIANTS.items():
-        fusion = LateCascadeFusion(FusionConfig.preset("kitti").updated(**changes), default_localizer())
+        fusion = LateCascadeFusion(FusionConfig.preset("kitti").updated(**changes), ShippedLocalizer())
         timed = [_timed(partial(fusion, item.frame, item.lidar, item.camera)) for item in frames]
         found[name] = [fused.detections for fused, _ in timed]
         milliseconds[name] = float(np.median([spent for _, spent in timed]))

@@ -12,6 +12,7 @@ from lcf3d.evaluation.calibration_study import average_precisions, result_object
 from lcf3d.evaluation.kitti import evaluate
 from lcf3d.formats.kitti import KittiFrames
 from lcf3d.fusion.calibration import Calibration
+from lcf3d.fusion.clustering import cluster_boxes
 from lcf3d.fusion.config import FusionConfig
 from lcf3d.fusion.pipeline import LateCascadeFusion
 from lcf3d.localizers.base import Localizer
@@ -119,6 +120,7 @@ def ablate(
     calibration: Calibration | None = None,
     localizer: Localizer | None = None,
     progress: Progress = lambda indices: indices,
+    suppress: bool = False,
 ) -> list[AblationRow]:
     """Measure all variants on frames of a KITTI-layout dataset.
 
@@ -129,15 +131,25 @@ def ablate(
         calibration: score calibration, see `LateCascadeFusion`.
         localizer: for recovery, see `LateCascadeFusion`.
         progress: wraps the loop over variants, for a progress bar.
+        suppress: the LiDAR detections are without non-maximum suppression: LiDAR alone is measured after it.
     """
     scans = all(item.frame.points is not None for item in inputs)
     masks = any(item.camera.masks is not None for item in inputs)
     chosen = variants(config, scans, masks)
-    return [_measure(inputs, truth, chosen[i], config, calibration, localizer) for i in progress(range(len(chosen)))]
+    alone = [suppressed(item.lidar) for item in inputs] if suppress else [item.lidar for item in inputs]
+    return [
+        _measure(inputs, alone, truth, chosen[i], config, calibration, localizer) for i in progress(range(len(chosen)))
+    ]
+
+
+def suppressed(lidar: Detections3D) -> Detections3D:
+    """What a LiDAR detector gives by itself: the best of boxes that overlap in bird's-eye view."""
+    return lidar[cluster_boxes(lidar.boxes, lidar.scores, lidar.labels, method="nms").representative]
 
 
 def _measure(
     inputs: Sequence[AblationInput],
+    alone: Sequence[Detections3D],
     truth: KittiFrames,
     variant: Variant,
     config: FusionConfig,
@@ -149,8 +161,7 @@ def _measure(
     fusion = None
     if variant.changes is not None:
         fusion = LateCascadeFusion(config.updated(**variant.changes), localizer, calibration)
-    for item in inputs:
-        detections = item.lidar
+    for item, detections in zip(inputs, alone, strict=True):
         if fusion is not None:
             fused = fusion(item.frame, item.lidar, {item.frame.cameras[0].name: item.camera})
             detections = fused.detections
