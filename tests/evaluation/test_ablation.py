@@ -3,8 +3,9 @@ import pytest
 
 from lcf3d import FusionConfig
 from lcf3d.cli.calibrate import open_study
-from lcf3d.evaluation.ablation import MODULES, AblationInput, ablate, variants
+from lcf3d.evaluation.ablation import MODULES, AblationInput, ablate, suppressed, variants
 from lcf3d.fusion.self_calibration import self_calibrate
+from lcf3d.structures import KITTI_CLASSES, Detections3D
 from tests.evaluation.drive import write_drive
 
 CONFIG = FusionConfig.preset("kitti")
