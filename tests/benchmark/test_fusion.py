@@ -22,7 +22,7 @@ def test_the_reference_does_the_same_as_ours():
 
 def test_every_stage_is_measured_beside_a_reference():
     timings = {t.name: t for t in bench_fusion(seconds=0.01)}
-    assert len(timings) == 6
+    assert len(timings) == 8
     assert timings["bounding box matching, 500 x 40"].speedup > 1
     assert all(t.median_ms >= t.best_ms > 0 for t in timings.values())
 
