@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -126,6 +127,20 @@ def train(
         MissingExtraError: torch is not installed.
     """
     torch = import_torch()
+    with _deterministic(torch):
+        return _train(torch, task, settings, folder, resume, report, start)
+
+
+def _train(
+    torch: Any,
+    task: TrainingTask,
+    settings: TrainingSettings,
+    folder: Path,
+    resume: bool,
+    report: Callable[[Progress], None],
+    start: Path | None,
+) -> Any:
+    """See `train`."""
     rank, world = _join(torch)
     run = _Run(torch, task, settings, folder, rank)
     if start is not None:
@@ -154,6 +169,17 @@ def train(
         report(run.note(done, terms, figures))
     run.close()
     return run.averaged
+
+
+@contextmanager
+def _deterministic(torch: Any) -> Iterator[None]:
+    """Sums in a fixed order, whatever the number of threads, where torch has an algorithm for that."""
+    before = torch.are_deterministic_algorithms_enabled(), torch.is_deterministic_algorithms_warn_only_enabled()
+    torch.use_deterministic_algorithms(True, warn_only=True)
+    try:
+        yield
+    finally:
+        torch.use_deterministic_algorithms(before[0], warn_only=before[1])
 
 
 class _Run:
