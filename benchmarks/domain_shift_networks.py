@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lcf3d.detectors.specs import load_detector
+from lcf3d.detectors.named import load_detector
 from lcf3d.evaluation.domain_report import COLUMNS, table_values
 from lcf3d.evaluation.domain_shift import (
     AdaptedLidar,

@@ -5,7 +5,7 @@
 
 The frustums come from the labels' own 2D boxes, or (``--boxes``) from the 2D detections of a folder of KITTI result
 files, each taken with the label of its class that it overlaps most (IoU of 0.5 or more). ``--localizer`` is what
-``lcf3d run --localizer`` takes: geometric, network, hybrid, onnx:FILE, ...
+``lcf3d run --localizer`` takes: geometric, network, onnx:FILE, ...
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from lcf3d.datasets.kitti import KittiDataset
 from lcf3d.errors import DatasetError
 from lcf3d.formats.kitti import KittiObjects, detections_2d, read_objects
 from lcf3d.fusion.frustum import FrustumProposals, extract_frustums
+from lcf3d.fusion.localizer import Localizer
 from lcf3d.geometry.boxes import lidar_from_kitti
 from lcf3d.geometry.camera import project_boxes
 from lcf3d.geometry.iou import bev_iou, image_iou, iou_3d
-from lcf3d.localizers.base import Localizer
 from lcf3d.localizers.named import load_localizer
 from lcf3d.structures import KITTI_CLASSES, Camera, Detections2D, FloatArray
 
@@ -176,7 +176,7 @@ def main() -> None:
     parser.add_argument("--boxes", type=Path, help="folder of KITTI result files; default: the labels' 2D boxes")
     parser.add_argument("--score", type=float, default=0.5, help="least score of a 2D detection")
     parser.add_argument("--jitter", type=float, default=0.0, help="move the edges of label boxes by up to this share")
-    parser.add_argument("--localizer", default="hybrid", help="as for lcf3d run")
+    parser.add_argument("--localizer", default="geometric", help="as for lcf3d run")
     parser.add_argument("--json", type=Path, help="write every object's figures to this file")
     parser.add_argument("--each", action="store_true", help="print every object")
     arguments = parser.parse_args()

@@ -14,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 
-from lcf3d.cli.train_common import default_samples_root, prepare_samples
 from lcf3d.fusion.frustum import FrustumProposals, extract_frustums
 from lcf3d.geometry.boxes import points_in_boxes
 from lcf3d.geometry.camera import project_boxes
@@ -23,13 +22,14 @@ from lcf3d.localizers.spec import TEMPLATES
 from lcf3d.structures import Detections2D, FloatArray
 from lcf3d.training.frustums import FEWEST_ON_OBJECT, LOWEST_PX, scenes_of_samples
 from lcf3d.training.localizer import paired_iou
-from lcf3d.training.recipes import recipe_of, training_cameras
+from lcf3d.training.recipes import default_samples_root, recipe_of, training_cameras
+from lcf3d.training.samples import write_samples
 
 
 def proposals_of(classes: str, root: Path, views: int, jitter: float) -> Iterator[tuple[FrustumProposals, FloatArray]]:
     """Frustums of each scene, with the true boxes in their frustum frames."""
     recipe, names = recipe_of(classes), tuple(TEMPLATES[classes])
-    paths = prepare_samples(recipe.samples, root, jobs=2)[-recipe.held_out :]
+    paths = write_samples(recipe.samples, root / recipe.samples.folder, 2)[-recipe.held_out :]
     rng = np.random.default_rng(0)
     for scene in scenes_of_samples(paths, training_cameras(recipe), views, seed=1):
         boxes2d, visible = project_boxes(scene.boxes, scene.camera)

@@ -20,11 +20,11 @@ import numpy as np
 
 from lcf3d import FusionConfig, LateCascadeFusion, Lcf3dError
 from lcf3d.datasets.nuscenes import NuscenesDataset
-from lcf3d.detectors.results import NuscenesCameraResults, NuscenesLidarResults
 from lcf3d.evaluation.nuscenes import NuscenesMetrics, evaluate_nuscenes
 from lcf3d.formats.nuscenes_boxes import global_from_detections
 from lcf3d.fusion.evidence import Evidence
 from lcf3d.provenance import FusedDetections
+from lcf3d.run.results import NuscenesCameraResults, NuscenesLidarResults
 from lcf3d.structures import NUSCENES_CLASSES, Detections2D, Detections3D, Frame
 
 # the weights that the kitti preset has for people, without the rival, for every class

@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 
 from lcf3d.datasets.kitti import KittiDataset
-from lcf3d.formats.run_folder import KittiRunFolder
 from lcf3d.geometry.iou import bev_iou, iou_3d
 from lcf3d.provenance import Reason, Stage
+from lcf3d.run.folder import KittiRunFolder
 
 # Van and Person_sitting are neighbours of Car and Pedestrian: a box on one of them is no mistake
 CLASSES = ("Car", "Pedestrian", "Cyclist", "Van", "Truck", "Person_sitting", "Misc")

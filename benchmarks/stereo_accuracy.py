@@ -115,7 +115,7 @@ def main() -> None:
 
     detector: Any = None
     if options.camera:
-        from lcf3d.detectors.specs import load_detector
+        from lcf3d.detectors.named import load_detector
 
         detector = load_detector(options.camera, "camera", KITTI_CLASSES)
     stereo = StereoConfig.preset(options.preset)

@@ -7,10 +7,10 @@ from typer.testing import CliRunner
 from lcf3d.cli.app import app
 from lcf3d.errors import Lcf3dError
 from lcf3d.formats.kitti import objects_from_detections_2d, read_objects, write_objects
-from lcf3d.formats.run_folder import RunFolder
 from lcf3d.geometry.camera import project_boxes
 from lcf3d.localizers.named import SHIPPED
 from lcf3d.provenance import Stage
+from lcf3d.run.folder import RunFolder
 from lcf3d.structures import KITTI_CLASSES, Detections2D
 from tests.datasets.kitti_folder import LABELS, make_kitti, make_results
 

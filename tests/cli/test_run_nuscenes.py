@@ -14,9 +14,9 @@ from lcf3d.datasets.nuscenes import NuscenesDataset
 from lcf3d.datasets.nuscenes_tables import CAMERAS
 from lcf3d.formats.coco import encode_mask
 from lcf3d.formats.nuscenes import read_submission
-from lcf3d.formats.run_folder import RunFolder
 from lcf3d.geometry.camera import project_boxes
 from lcf3d.provenance import Stage
+from lcf3d.run.folder import RunFolder
 from lcf3d.structures import NUSCENES_CLASSES, Detections3D, Frame
 from tests.fusion.scenes import camera, surface_points
 

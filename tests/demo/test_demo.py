@@ -5,8 +5,8 @@ import pytest
 from typer.testing import CliRunner
 
 from lcf3d.cli.app import app
+from lcf3d.datasets.drive import read_drive
 from lcf3d.demo.drive import FULL, LIDAR_ALONE, VARIANTS, drive, ground_truth, measure, shipped_detectors
-from lcf3d.demo.shipped import read_drive
 from lcf3d.geometry.boxes import points_in_boxes
 from lcf3d.provenance import Stage
 

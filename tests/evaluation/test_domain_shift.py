@@ -1,11 +1,13 @@
 import json
 import sys
+from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from lcf3d import plugins
 from lcf3d.cli.app import app, main
 from lcf3d.datasets.convert import write_nuscenes
 from lcf3d.datasets.kitti import KittiDataset
@@ -310,9 +312,8 @@ def test_a_detector_of_the_other_data_gets_adapted_points(folders: dict[str, Pat
 
     monkeypatch.setitem(sys.modules, "my_lidar", type(sys)("my_lidar"))
     sys.modules["my_lidar"].Build = build
-    monkeypatch.setitem(
-        __import__("lcf3d.detectors.specs", fromlist=["KINDS"]).KINDS["lidar"], "mine", "my_lidar:Build"
-    )
+    point = EntryPoint("mine", "my_lidar:Build", "lcf3d.lidar_detectors")
+    monkeypatch.setattr(plugins, "_points", lambda group: {"mine": point})
     task = parse_task(f"nuscenes->kitti kitti:{folders['kitti']} lidar=mine:x split=val")
     result = DomainTaskRunner(task, FusionConfig())()
     raw = KittiDataset(folders["kitti"], "val")[0].points

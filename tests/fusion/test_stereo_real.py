@@ -6,12 +6,12 @@ import pytest
 from lcf3d import Lcf3dError
 from lcf3d.datasets.kitti import KittiDataset
 from lcf3d.detectors.camera.onnx import OnnxDetector
-from lcf3d.detectors.results import LidarResults
 from lcf3d.fusion.stereo import StereoConfig, StereoLateCascadeFusion
 from lcf3d.fusion.stereo_pairing import epipolar_costs
 from lcf3d.geometry.epipolar import fundamental_matrix
 from lcf3d.geometry.iou import iou_3d
 from lcf3d.provenance import Stage
+from lcf3d.run.results import LidarResults
 from lcf3d.structures import KITTI_CLASSES, Detections3D
 
 pytestmark = pytest.mark.real

@@ -3,25 +3,9 @@ import pytest
 
 from lcf3d.errors import ConfigError, DetectorError
 from lcf3d.localizers.geometric import GeometricLocalizer
-from lcf3d.localizers.named import SHIPPED, HybridLocalizer, ShippedLocalizer, load_localizer
+from lcf3d.localizers.named import SHIPPED, ShippedLocalizer, load_localizer
 from lcf3d.localizers.onnx import OnnxLocalizer
 from tests.localizers.scenes import street_proposals
-
-
-class Fixed:
-    """Gives every frustum the same box."""
-
-    def __call__(self, proposals):
-        return np.tile([5.0, 0, 0, 1, 1, 1, 0], (len(proposals), 1)), np.full(len(proposals), 0.4)
-
-
-def test_a_hybrid_asks_each_for_its_classes():
-    proposals = street_proposals()
-    boxes, quality = HybridLocalizer(Fixed(), {"Pedestrian"})(proposals)
-    expected, sure = GeometricLocalizer()(proposals)
-    np.testing.assert_array_equal(boxes[1], [5, 0, 0, 1, 1, 1, 0])
-    np.testing.assert_allclose(boxes[[0, 2]], expected[[0, 2]])
-    np.testing.assert_allclose(quality, [sure[0], 0.4, sure[2]])
 
 
 @pytest.mark.parametrize("dataset", list(SHIPPED))
@@ -59,9 +43,13 @@ def test_classes_a_network_does_not_know_get_no_box():
 def test_names(tmp_path):
     assert isinstance(load_localizer("geometric"), GeometricLocalizer)
     assert isinstance(load_localizer(f"onnx:{SHIPPED['kitti']}"), OnnxLocalizer)
-    for text in ("best", "onnx", "onnx:", "geometric:3"):
-        with pytest.raises(ConfigError, match="unknown localizer"):
+    with pytest.raises(ConfigError, match="unknown localizer kind 'best'; installed: frustum-pointnet, geometric"):
+        load_localizer("best")
+    for text in ("onnx", "onnx:"):
+        with pytest.raises(ConfigError, match="localizer 'onnx' needs an argument: onnx:PATH"):
             load_localizer(text)
+    with pytest.raises(ConfigError, match="localizer 'geometric' takes no argument"):
+        load_localizer("geometric:3")
     with pytest.raises(DetectorError, match="does not exist"):
         load_localizer("onnx:nowhere.onnx")
     (tmp_path / "torn.onnx").write_bytes(b"no network")

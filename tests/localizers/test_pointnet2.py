@@ -76,5 +76,5 @@ def test_other_checkpoints_are_refused_by_the_parameter_that_does_not_fit(tmp_pa
     with pytest.raises(DetectorError, match=r"has 50 rows, expected 39 \(kitti\) or 67 \(nuscenes\)"):
         TorchLocalizer(path)
     torch.save({**state, "tnet.fc1.weight": torch.zeros(256, 7)}, path)
-    with pytest.raises(DetectorError, match=r"'tnet\.fc1\.weight' has shape \(256, 7\), expected \(256, 259\)"):
+    with pytest.raises(DetectorError, match=r"tnet\.fc1\.weight \(expected \(256, 259\), got \(256, 7\)\)"):
         TorchLocalizer(path)

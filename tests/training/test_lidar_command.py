@@ -8,9 +8,9 @@ from itertools import islice
 import numpy as np
 import pytest
 
-from lcf3d.demo.shipped import read_drive
+from lcf3d.datasets.drive import read_drive
 from lcf3d.errors import ConfigError
-from lcf3d.formats.files import write_json
+from lcf3d.files import write_json
 from lcf3d.structures import KITTI_CLASSES, Detections3D
 from lcf3d.training.lidar_evaluation import detector_figures, drive_scans, sample_scans
 from lcf3d.training.samples import RECIPE_FILE, SampleRecipe

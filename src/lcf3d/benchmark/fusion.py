@@ -35,7 +35,7 @@ def bench_fusion(seconds: float = 1.0) -> list[Timing]:
     timings = [_matching(lidar, camera, seconds) for lidar, camera in MATCHING_BUDGETS_MS]
     timings += [_one_spot(seconds), _semantic(seconds)]
     timings += [_recovery(name, seconds) for name in RECOVERY_BUDGETS_MS]
-    return [*timings, *(_step(name, seconds) for name in ("geometric", "hybrid"))]
+    return [*timings, *(_step(name, seconds) for name in ("geometric", "network"))]
 
 
 def _matching(lidar_count: int, camera_count: int, seconds: float) -> Timing:

@@ -12,11 +12,11 @@ from lcf3d.errors import ConfigError, DatasetError
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from lcf3d.cli.run_setup import RunRequest
     from lcf3d.evaluation.ablation import AblationInput, AblationRow
     from lcf3d.formats.kitti import KittiFrames
     from lcf3d.fusion.calibration import Calibration
     from lcf3d.fusion.config import FusionConfig
+    from lcf3d.run.setup import RunRequest
 
 
 def ablate(
@@ -29,7 +29,7 @@ def ablate(
     ] = "auto",
     config: Annotated[str, typer.Option(help="preset or YAML file that the variants change")] = "kitti",
     set_: Annotated[list[str] | None, typer.Option("--set", help="change a setting, name=value; repeatable")] = None,
-    localizer: Annotated[str, typer.Option(help="for recovery, as for lcf3d run")] = "hybrid",
+    localizer: Annotated[str, typer.Option(help="for recovery, as for lcf3d run")] = "geometric",
     tiles: Annotated[int, typer.Option(min=1, help="overlapping tiles across wide images, for onnx: detectors")] = 1,
     missing: Annotated[str, typer.Option(help="result files that are not there: error, or empty")] = "error",
     json_: Annotated[bool, typer.Option("--json", help="print the rows as JSON")] = False,
@@ -47,9 +47,9 @@ def ablate(
     import json
 
     from lcf3d.cli.calibrate import plain, tracked, wide_console
-    from lcf3d.cli.run_setup import RunRequest
     from lcf3d.evaluation.ablation import ablate as measure
     from lcf3d.localizers.named import load_localizer
+    from lcf3d.run.setup import RunRequest
 
     request = RunRequest(
         dataset, lidar, {"left": camera}, split, config=config, changes=tuple(set_ or ()), tiles=tiles, missing=missing
@@ -70,11 +70,11 @@ def ablate(
 
 def _read(request: RunRequest) -> tuple[list[AblationInput], KittiFrames, FusionConfig, bool]:
     """Frames with their detections, the labels, the settings, and whether a LiDAR network ran here without NMS."""
-    from lcf3d.cli.run_setup import read_inputs
     from lcf3d.datasets.kitti import KittiDataset
-    from lcf3d.detectors.sources import LidarOnScans
     from lcf3d.evaluation.ablation import AblationInput
     from lcf3d.formats.kitti import read_folder
+    from lcf3d.run.setup import read_inputs
+    from lcf3d.run.sources import LidarOnScans
 
     found = read_inputs(request)
     if not isinstance(found.dataset, KittiDataset):

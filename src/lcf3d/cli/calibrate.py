@@ -37,7 +37,7 @@ def calibrate(
     import json
     from dataclasses import asdict
 
-    from lcf3d.cli.options import build_config
+    from lcf3d.run.settings import build_config
 
     settings = build_config(config, set_ or []).updated(ensemble="evidence", unmatched="downweight")
     study = open_study(dataset, split, lidar, camera, settings, folds, missing, quiet=json_)

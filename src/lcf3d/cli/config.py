@@ -17,7 +17,7 @@ def config(
 
     Example: lcf3d config kitti --set unmatched=drop --out my.yaml
     """
-    from lcf3d.cli.options import build_config
+    from lcf3d.run.settings import build_config
 
     settings = build_config(preset, set_ or [])
     if out is None:

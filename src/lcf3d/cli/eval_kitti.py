@@ -134,7 +134,7 @@ def _open(question: KittiQuestion, results: Path, config: KittiEvaluationConfig,
 
 def _split_of_run(results: Path) -> str | None:
     """The split that ``lcf3d run`` noted beside its results, if it did."""
-    from lcf3d.formats.files import read_json
+    from lcf3d.files import read_json
 
     note = _run_folder(results) / "run.json"
     if not note.is_file():
@@ -182,7 +182,7 @@ def _closer_look(
         return
     from lcf3d.evaluation.kitti_pictures import worst_frame_pictures
     from lcf3d.evaluation.report import html_report
-    from lcf3d.formats.files import write_json, write_text
+    from lcf3d.files import write_json, write_text
 
     pictures = worst_frame_pictures(studies[-1], question.root, worst)
     write_json(out / "metrics.json", content)
@@ -195,7 +195,7 @@ def _nds_hat(
     """NDS^ of the results in the left camera's view, which is all that KITTI annotates."""
     from lcf3d.datasets.kitti import KittiDataset
     from lcf3d.evaluation.generalization import evaluate_generalization
-    from lcf3d.formats.files import write_json
+    from lcf3d.files import write_json
     from lcf3d.formats.kitti import detections_3d
 
     data = KittiDataset(question.root)

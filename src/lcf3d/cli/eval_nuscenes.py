@@ -49,7 +49,7 @@ def eval_nuscenes(
     from lcf3d.datasets.nuscenes_loading import load_tables
     from lcf3d.datasets.nuscenes_splits import default_split, scenes_of_split
     from lcf3d.evaluation.nuscenes import evaluate_nuscenes
-    from lcf3d.formats.files import write_json
+    from lcf3d.files import write_json
     from lcf3d.formats.nuscenes import read_submission
 
     version = version or find_version(root)

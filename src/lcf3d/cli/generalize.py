@@ -44,10 +44,10 @@ def generalize(
 
     from rich.console import Console
 
-    from lcf3d.cli.options import build_config
     from lcf3d.evaluation.domain_report import charts, html_report, standalone_svg, to_json
     from lcf3d.evaluation.domain_tasks import DomainTaskRunner, parse_task
-    from lcf3d.formats.files import write_json, write_text
+    from lcf3d.files import write_json, write_text
+    from lcf3d.run.settings import build_config
     from lcf3d.structures import KITTI_CLASSES
 
     names = tuple(class_ or KITTI_CLASSES)

@@ -10,8 +10,8 @@ import typer
 from lcf3d.errors import ConfigError
 
 if TYPE_CHECKING:
-    from lcf3d.cli.run_setup import Run
-    from lcf3d.runner import FrameSummary
+    from lcf3d.run.frames import FrameSummary
+    from lcf3d.run.setup import Run
 
 
 def run(
@@ -34,8 +34,8 @@ def run(
     set_: Annotated[list[str] | None, typer.Option("--set", help="change a setting, name=value; repeatable")] = None,
     recovery: Annotated[str | None, typer.Option(help="on or off; off needs no scans")] = None,
     localizer: Annotated[
-        str, typer.Option(help="hybrid, geometric, network, onnx:FILE or frustum-pointnet:CHECKPOINT")
-    ] = "hybrid",
+        str, typer.Option(help="geometric, network, onnx:FILE or frustum-pointnet:CHECKPOINT")
+    ] = "geometric",
     tiles: Annotated[int, typer.Option(min=1, help="overlapping tiles across wide images, for onnx: detectors")] = 1,
     calibration: Annotated[
         str, typer.Option(help="score calibration: a file of 'lcf3d calibrate', auto, or none")
@@ -59,8 +59,8 @@ def run(
     """
     import json
 
-    from lcf3d.cli.run_setup import RunRequest, prepare_run
-    from lcf3d.runner import total
+    from lcf3d.run.frames import total
+    from lcf3d.run.setup import RunRequest, prepare_run
 
     request = RunRequest(
         dataset=dataset,
@@ -103,7 +103,7 @@ def _fuse(prepared: Run, pending: list[str], jobs: int, quiet: bool) -> list[Fra
     """Run the frames under a progress bar."""
     from rich.progress import Progress
 
-    from lcf3d.runner import run_frames
+    from lcf3d.run.frames import run_frames
 
     summaries = []
     with Progress(disable=quiet) as progress:

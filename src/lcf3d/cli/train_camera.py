@@ -79,7 +79,7 @@ def camera(
 def _finish(task: CameraTask, network: Any, out: Path) -> None:
     """Calibrate the network's scores, write it with its figures, and say where it is."""
     from lcf3d.detectors.camera.small_export import export_small
-    from lcf3d.formats.files import write_json
+    from lcf3d.files import write_json
     from lcf3d.training.camera_calibration import calibrate
 
     calibrate(network, task.held_out)
@@ -92,8 +92,9 @@ def _finish(task: CameraTask, network: Any, out: Path) -> None:
 
 
 def _simulated_images(frames: int, seed: int, root: Path | None, jobs: int, masks: bool) -> list[LabelledImage]:
-    from lcf3d.cli.train_common import default_samples_root, prepare_samples
+    from lcf3d.cli.train_common import prepare_samples
     from lcf3d.training.camera_images import read_samples
+    from lcf3d.training.recipes import default_samples_root
     from lcf3d.training.samples import SampleRecipe
 
     recipe = SampleRecipe("camera", "kitti64", frames, seed, SAMPLE_SCALE)

@@ -2,18 +2,12 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from lcf3d.training.loop import TrainingSettings, TrainingTask
     from lcf3d.training.samples import SampleRecipe
-
-
-def default_samples_root() -> Path:
-    """Where simulated samples are kept between trainings: ``lcf3d/samples`` in the user's cache folder."""
-    return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "lcf3d" / "samples"
 
 
 def prepare_samples(recipe: SampleRecipe, root: Path, jobs: int) -> list[Path]:

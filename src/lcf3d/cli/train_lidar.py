@@ -82,7 +82,7 @@ def lidar(
 def _write(task: LidarTask, network: Any, out: Path) -> None:
     """Write the trained network and its figures on the held-out scans."""
     from lcf3d.detectors.lidar.export import export_onnx
-    from lcf3d.formats.files import write_json
+    from lcf3d.files import write_json
     from lcf3d.training.lidar import trained_detector
 
     export_onnx(trained_detector(network, task.config), out / "lidar.onnx")
@@ -107,7 +107,8 @@ def _scans(
 
     if dataset:
         return dataset_scans(dataset, split, KITTI_CLASSES, version)
-    from lcf3d.cli.train_common import default_samples_root, prepare_samples
+    from lcf3d.cli.train_common import prepare_samples
+    from lcf3d.training.recipes import default_samples_root
     from lcf3d.training.samples import SampleRecipe
 
     recipe = SampleRecipe("lidar", preset, frames, samples_seed)

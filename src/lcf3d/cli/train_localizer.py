@@ -76,9 +76,9 @@ def _pools(
     jobs: int,
 ) -> tuple[list[PooledFrustum], list[PooledFrustum]]:
     """Training and held-out frustums, from the dataset or the recipe's simulated scans."""
-    from lcf3d.cli.train_common import default_samples_root, prepare_samples
+    from lcf3d.cli.train_common import prepare_samples
     from lcf3d.training.frustums import collect, scenes_of_dataset, scenes_of_samples
-    from lcf3d.training.recipes import training_cameras
+    from lcf3d.training.recipes import default_samples_root, training_cameras
 
     labels = {name: k for k, name in enumerate(spec.class_names)}
     labels |= {other: labels[name] for other, name in recipe.synonyms.items()}
@@ -109,7 +109,7 @@ def _save(network: Any, spec: LocalizerSpec, out: Path) -> Path:
 
         export_onnx(network, spec, out / "localizer.onnx")
         return out / "localizer.onnx"
-    from lcf3d.formats.files import atomic_path
+    from lcf3d.files import atomic_path
     from lcf3d.training.loop import import_torch
 
     path = out / "localizer.pth"

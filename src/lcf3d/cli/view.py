@@ -75,7 +75,7 @@ def _is_run(path: Path) -> bool:
 
 def _open_run(run_folder: Path) -> KittiDataset | NuscenesDataset:
     """The dataset that a run was made from."""
-    from lcf3d.formats.files import read_json
+    from lcf3d.files import read_json
 
     run = read_json(run_folder / "run.json")
     dataset = run.get("dataset") if isinstance(run, dict) else None
@@ -134,7 +134,7 @@ def _scenes(
     if shown is None:
         return lambda frame: Scene.from_detections(Detections3D.empty(()), truth=frame.labels if truth else None)
     if _is_run(shown):
-        from lcf3d.formats.run_folder import RunFolder
+        from lcf3d.run.folder import RunFolder
 
         folder = RunFolder(shown)
         return lambda frame: Scene.from_fused(folder.read(frame.id), frame.labels if truth else None, min_score)

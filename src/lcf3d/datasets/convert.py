@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from lcf3d.datasets.nuscenes import RAW_FROM_CANONICAL
 from lcf3d.datasets.nuscenes_tables import CAMERAS, DETECTION_CLASS_OF_CATEGORY, LIDAR
 from lcf3d.errors import ConfigError
-from lcf3d.formats.files import atomic_path, write_json, write_text
+from lcf3d.files import atomic_path, write_json, write_text
 from lcf3d.formats.kitti import KittiObjects, objects_from_detections, write_objects
 from lcf3d.formats.nuscenes_boxes import NUSCENES_ATTRIBUTES, global_from_detections
 from lcf3d.geometry.boxes import points_in_boxes

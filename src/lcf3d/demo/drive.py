@@ -12,9 +12,9 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from lcf3d.demo.shipped import ShippedFrame, read_drive
+from lcf3d.datasets.drive import ShippedFrame, read_drive
 from lcf3d.detectors.base import CameraDetector, LidarDetector
-from lcf3d.detectors.specs import load_detector
+from lcf3d.detectors.named import load_detector
 from lcf3d.evaluation.ablation import suppressed
 from lcf3d.evaluation.generalization import GeneralizationMetrics, evaluate_generalization
 from lcf3d.fusion.config import FusionConfig
@@ -183,7 +183,7 @@ def measure(frames: list[DemoFrame]) -> DemoResult:
 
 def write_pictures(frames: Sequence[DemoFrame], folder: Path) -> list[Path]:
     """One PNG a frame and an animation; gives the paths written."""
-    from lcf3d.formats.files import atomic_path
+    from lcf3d.files import atomic_path
     from lcf3d.visualization.png import draw_frame, save_png
     from lcf3d.visualization.scene import Scene
 

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from scipy import ndimage
 
-from lcf3d.demo.shipped import DRIVE, Distractors, Objects, ShippedFrame, write_drive
+from lcf3d.datasets.drive import DRIVE, Distractors, Objects, ShippedFrame, write_drive
 from lcf3d.geometry.boxes import transform_boxes
 from lcf3d.geometry.rotation import invert_rigid
 from lcf3d.simulation import simulate_drive

@@ -15,7 +15,7 @@ from urllib.parse import urlparse
 from urllib.request import urlopen
 
 from lcf3d.errors import DetectorError
-from lcf3d.formats.files import atomic_path
+from lcf3d.files import atomic_path
 
 _ROOT = "https://download.openmmlab.com/mmdetection3d/"
 CACHE = Path("~/.cache/lcf3d/models")

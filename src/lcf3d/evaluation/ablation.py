@@ -14,8 +14,8 @@ from lcf3d.formats.kitti import KittiFrames
 from lcf3d.fusion.calibration import Calibration
 from lcf3d.fusion.clustering import cluster_boxes
 from lcf3d.fusion.config import FusionConfig
+from lcf3d.fusion.localizer import Localizer
 from lcf3d.fusion.pipeline import LateCascadeFusion
-from lcf3d.localizers.base import Localizer
 from lcf3d.provenance import Stage
 from lcf3d.structures import Detections2D, Detections3D, Frame
 

@@ -11,9 +11,7 @@ from typing import Any, Literal
 from lcf3d.datasets.kitti import KittiDataset
 from lcf3d.datasets.nuscenes import NuscenesDataset
 from lcf3d.datasets.opening import parse_dataset
-from lcf3d.detectors.results import NuscenesCameraResults, NuscenesLidarResults
-from lcf3d.detectors.sources import CameraOnImages, CameraSource, LidarSource
-from lcf3d.detectors.specs import load_detector, parse_spec
+from lcf3d.detectors.named import load_detector
 from lcf3d.errors import ConfigError, DatasetError
 from lcf3d.evaluation.domain_shift import (
     LABEL_CLASSES,
@@ -30,6 +28,9 @@ from lcf3d.fusion.calibration import Calibration, load_calibration
 from lcf3d.fusion.config import FusionConfig
 from lcf3d.fusion.pipeline import LateCascadeFusion
 from lcf3d.fusion.self_calibration import self_calibrate
+from lcf3d.plugins import parse as parse_spec
+from lcf3d.run.results import NuscenesCameraResults, NuscenesLidarResults
+from lcf3d.run.sources import CameraOnImages, CameraSource, LidarSource
 from lcf3d.structures import KITTI_CLASSES, NUSCENES_CLASSES, Camera, Detections2D, Detections3D, Frame
 
 FRONT = {"kitti": "left", "nuscenes": "CAM_FRONT"}

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from lcf3d.evaluation.curves import best_f1_score
 from lcf3d.evaluation.kitti import KittiEvaluator, Selection
 from lcf3d.evaluation.kitti_matching import COUNTS, FALSE_POSITIVE, TRUE_POSITIVE
-from lcf3d.formats.files import read_json
+from lcf3d.files import read_json
 from lcf3d.formats.kitti import KittiFrames, KittiObjects
 from lcf3d.geometry.boxes import kitti_from_lidar
 from lcf3d.provenance import FusedDetections, Reason, Stage

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lcf3d.errors import FormatError
-from lcf3d.formats.files import read_json, write_json
+from lcf3d.files import read_json, write_json
 from lcf3d.structures import Detections2D, InstanceMask
 
 CameraDetections = dict[tuple[str, str], Detections2D]

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lcf3d.errors import DatasetError, FormatError, ShapeError
-from lcf3d.formats.files import write_text
+from lcf3d.files import write_text
 from lcf3d.formats.kitti_text import (
     LABEL_COLUMNS,
     NO_LOCATION,

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from lcf3d.errors import FormatError
-from lcf3d.formats.files import write_text
+from lcf3d.files import write_text
 from lcf3d.formats.json_stream import JsonCursor
 from lcf3d.formats.nuscenes_boxes import NUSCENES_ATTRIBUTES, GlobalBoxes
 from lcf3d.structures import NUSCENES_CLASSES, BoolArray, FloatArray

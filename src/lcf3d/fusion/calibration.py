@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from lcf3d.errors import ConfigError
-from lcf3d.formats.files import read_json, write_text
+from lcf3d.files import read_json, write_text
 from lcf3d.fusion.evidence import MAX_LOG_ODDS, Evidence, to_probability
 from lcf3d.structures import Detections2D, Detections3D, FloatArray
 

@@ -10,7 +10,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from lcf3d.errors import ConfigError
-from lcf3d.formats.files import write_text
+from lcf3d.files import write_text
 from lcf3d.fusion.evidence import Evidence
 from lcf3d.structures import KITTI_CLASSES, NUSCENES_CLASSES, FloatArray
 

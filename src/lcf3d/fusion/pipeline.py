@@ -7,10 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 
+from lcf3d import plugins
 from lcf3d.fusion.branches import Branches, prepare_branches
 from lcf3d.fusion.calibration import Calibration
 from lcf3d.fusion.clustering import Clusters, cluster_boxes
 from lcf3d.fusion.config import FusionConfig
+from lcf3d.fusion.localizer import Localizer
 from lcf3d.fusion.matching import Matches, View, confirmed_elsewhere, match_view, merge_views
 from lcf3d.fusion.outcome import (
     ClusterOutcome,
@@ -21,7 +23,6 @@ from lcf3d.fusion.outcome import (
 )
 from lcf3d.fusion.recovery import Recovery, recover
 from lcf3d.fusion.weighing import Weighed, fused_scores, recovered_trust, weigh_clusters
-from lcf3d.localizers.base import Localizer
 from lcf3d.provenance import FusedDetections, Reason, Stage
 from lcf3d.structures import BoolArray, Detections2D, Detections3D, FloatArray, Frame, IntArray
 
@@ -31,7 +32,7 @@ class LateCascadeFusion:
 
     Args:
         config: settings; the defaults of `FusionConfig` if not given.
-        localizer: puts boxes into frustums; `lcf3d.localizers.named.default_localizer` if not given.
+        localizer: puts boxes into frustums; the geometric one if not given.
         calibration: what the detectors' scores mean, see `lcf3d.fusion.calibration`; scores are taken as they are if
             not given, and must then lie in [0, 1].
 
@@ -49,11 +50,7 @@ class LateCascadeFusion:
     ) -> None:
         self.config = config or FusionConfig()
         self.calibration = calibration or Calibration()
-        if localizer is None:
-            from lcf3d.localizers.named import default_localizer
-
-            localizer = default_localizer()
-        self.localizer = localizer
+        self.localizer: Localizer = localizer or plugins.load("lcf3d.localizers", "geometric")()
 
     def __call__(self, frame: Frame, lidar: Detections3D, camera: Mapping[str, Detections2D]) -> FusedDetections:
         """Fuse the detections of one frame.

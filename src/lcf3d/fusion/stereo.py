@@ -12,12 +12,12 @@ from lcf3d.errors import ConfigError
 from lcf3d.fusion.branches import Branches
 from lcf3d.fusion.clustering import Clusters
 from lcf3d.fusion.config import PRESETS, FusionConfig
+from lcf3d.fusion.localizer import Localizer
 from lcf3d.fusion.matching import Matches, View
 from lcf3d.fusion.outcome import ClusterOutcome
 from lcf3d.fusion.pipeline import LateCascadeFusion
 from lcf3d.fusion.semantic import fuse_scores
 from lcf3d.fusion.stereo_pairing import check_not_exchanged, check_stereo_pair, pair_views
-from lcf3d.localizers.base import Localizer
 from lcf3d.provenance import FusedDetections, Reason
 from lcf3d.structures import Detections2D, Detections3D, Frame, IntArray
 

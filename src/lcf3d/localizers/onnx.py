@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from lcf3d.detectors.onnx_session import open_session
 from lcf3d.errors import DetectorError
 from lcf3d.fusion.frustum import FrustumProposals
 from lcf3d.localizers.frustum_inputs import network_inputs
 from lcf3d.localizers.spec import LocalizerSpec, decode_boxes
+from lcf3d.networks.onnx import open_session
 from lcf3d.structures import FloatArray
 
 SPEC_KEY = "lcf3d.localizer"

@@ -13,12 +13,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from lcf3d.detectors.lidar._torch import Tensor, functional, nn, torch
 from lcf3d.errors import MissingExtraError
-from lcf3d.formats.files import atomic_path
+from lcf3d.files import atomic_path
 from lcf3d.localizers.frustum_inputs import CONTEXT, POINT_CHANNELS
 from lcf3d.localizers.onnx import INPUTS, OUTPUTS, SPEC_KEY
 from lcf3d.localizers.spec import LocalizerSpec
+from lcf3d.networks.torch import Tensor, functional, nn, torch
 
 OPSET = 17
 OUTSIDE = -1e4

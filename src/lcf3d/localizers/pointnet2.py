@@ -9,11 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from lcf3d.detectors.lidar._torch import Tensor, functional, nn, torch
 from lcf3d.detectors.lidar.backbones import ConvModule
 from lcf3d.detectors.lidar.point_ops import ball_query, farthest_point_sampling, three_nn_interpolation
 from lcf3d.localizers.pointnet import FrustumOutputs
 from lcf3d.localizers.spec import LocalizerSpec
+from lcf3d.networks.torch import Tensor, functional, nn, torch
 
 EPS = 1e-5
 FEWEST, MOST = 16, 128

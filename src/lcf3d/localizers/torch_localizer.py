@@ -8,15 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from lcf3d.detectors.checkpoints import read_state_dict
-from lcf3d.detectors.lidar._torch import torch
 from lcf3d.errors import DetectorError
 from lcf3d.fusion.frustum import FrustumProposals
 from lcf3d.localizers.onnx import localize
 from lcf3d.localizers.pointnet2 import FrustumPointNet2
 from lcf3d.localizers.spec import TEMPLATES, LocalizerSpec
+from lcf3d.networks.checkpoints import load_parameters, read_state_dict
+from lcf3d.networks.torch import torch
 from lcf3d.structures import FloatArray
-from lcf3d.training.loop import fill
 
 OUTPUT = "output_fc.weight"
 
@@ -38,7 +37,7 @@ class TorchLocalizer:
         state = read_state_dict(Path(path))
         self.spec = _spec_of(state, str(path))
         network = FrustumPointNet2(self.spec)
-        fill(network, _without_prefix(state), str(path))
+        load_parameters(network, _without_prefix(state), str(path))
         self.device = torch.device(device)
         self.network = network.eval().requires_grad_(False).to(self.device)
 

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from lcf3d.formats.files import atomic_path, write_text
+from lcf3d.files import atomic_path, write_text
 from lcf3d.formats.kitti import write_objects
 from lcf3d.simulation.frames import SimulatedFrame
 from lcf3d.simulation.labels import label_order

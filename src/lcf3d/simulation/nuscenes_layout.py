@@ -9,7 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from lcf3d.formats.files import atomic_path, read_json, write_json, write_text
+from lcf3d.files import atomic_path, read_json, write_json, write_text
 from lcf3d.geometry.rotation import quaternions_from_matrices, quaternions_from_yaws
 from lcf3d.simulation.actors import NUSCENES_CLASS
 from lcf3d.simulation.frames import SimulatedFrame, attribute

@@ -12,7 +12,7 @@ from types import ModuleType
 from typing import Final
 
 from lcf3d.errors import ConfigError, DatasetError, MissingExtraError
-from lcf3d.formats.files import read_json, write_json
+from lcf3d.files import read_json, write_json
 from lcf3d.simulation import kitti_layout, nuscenes_layout
 from lcf3d.simulation.frames import simulate_drive
 from lcf3d.simulation.presets import get_preset

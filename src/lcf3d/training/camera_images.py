@@ -108,7 +108,7 @@ def read_kitti(root: Path, split: str | None, size: tuple[int, int]) -> list[Lab
 
 def drive_images() -> list[LabelledImage]:
     """The images of the drive that comes with the package (without masks), boxes projected from the 3D labels."""
-    from lcf3d.demo.shipped import read_drive
+    from lcf3d.datasets.drive import read_drive
     from lcf3d.geometry.camera import project_boxes
 
     images = []

@@ -16,6 +16,7 @@ from lcf3d.detectors.lidar.statistics import pillar_statistics
 from lcf3d.errors import ConfigError
 from lcf3d.evaluation.generalization import evaluate_generalization
 from lcf3d.geometry.boxes import points_in_boxes
+from lcf3d.networks.checkpoints import load_parameters, read_training
 from lcf3d.structures import Detections3D
 from lcf3d.training.lidar_augmentation import (
     AugmentationSettings,
@@ -27,7 +28,7 @@ from lcf3d.training.lidar_augmentation import (
 )
 from lcf3d.training.lidar_scans import LabelledScan, ScanSource
 from lcf3d.training.lidar_targets import center_losses, center_targets
-from lcf3d.training.loop import fill, import_torch, load_checkpoint
+from lcf3d.training.loop import import_torch
 
 
 @dataclass(frozen=True)
@@ -68,7 +69,7 @@ class LidarTask:
 
         network = CompactPillars.build(self.config)
         if self.start is not None:
-            fill(network, load_checkpoint(self.start)["averaged"], str(self.start))
+            load_parameters(network, read_training(self.start)["averaged"], str(self.start))
         return network
 
     def batch(self, step: int, rng: np.random.Generator) -> dict[str, Any]:
@@ -141,7 +142,7 @@ def checkpoint_detector(path: Path, config: LidarConfig = COMPACT_KITTI, **optio
     from lcf3d.detectors.lidar.compact import CompactPillars
 
     network = CompactPillars.build(config)
-    fill(network, load_checkpoint(path)["averaged"], str(path))
+    load_parameters(network, read_training(path)["averaged"], str(path))
     return trained_detector(network, config, **options)
 
 

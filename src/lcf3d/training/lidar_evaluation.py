@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from lcf3d.datasets.drive import read_drive
 from lcf3d.datasets.kitti import KittiDataset
-from lcf3d.demo.shipped import read_drive
 from lcf3d.detectors.base import LidarDetector
 from lcf3d.errors import DatasetError
 from lcf3d.evaluation.generalization import evaluate_generalization

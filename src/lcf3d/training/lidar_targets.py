@@ -123,7 +123,7 @@ def center_losses(maps: Mapping[str, Any], batch: Mapping[str, Any], box_weight:
             (M, BOX_CHANNELS).
         box_weight: weight of the box terms.
     """
-    import torch
+    from lcf3d.networks.torch import torch
 
     logits, heat = maps["heatmap"].float(), batch["heat"]
     wanted = (heat >= 1).float()

@@ -16,10 +16,11 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from lcf3d.errors import ConfigError, DetectorError, MissingExtraError
-from lcf3d.formats.files import atomic_path, write_json
+from lcf3d.errors import ConfigError, DetectorError
+from lcf3d.files import atomic_path, write_json
+from lcf3d.networks.checkpoints import TRAINING_FORMAT, load_parameters, read_training
 
-LAST, FORMAT = "last.pt", "lcf3d-training-1"
+LAST = "last.pt"
 
 
 @dataclass(frozen=True)
@@ -201,9 +202,9 @@ class _Run:
 
     def start(self, path: Path) -> None:
         """Take the averaged weights of another training."""
-        weights = load_checkpoint(path)["averaged"]
-        fill(self.network, weights, str(path))
-        fill(self.averaged, weights, str(path))
+        weights = read_training(path)["averaged"]
+        load_parameters(self.network, weights, str(path))
+        load_parameters(self.averaged, weights, str(path))
 
     def begin(self) -> int:
         if (self.folder / LAST).exists():
@@ -217,11 +218,11 @@ class _Run:
         path = self.folder / LAST
         if not path.exists():
             return self.begin()
-        state = load_checkpoint(path)
+        state = read_training(path)
         if state["settings"] != asdict(self.settings):
             raise ConfigError(f"{path} was trained with other settings ({state['settings']}); use the same to go on")
-        fill(self.network, state["network"], str(path))
-        fill(self.averaged, state["averaged"], str(path))
+        load_parameters(self.network, state["network"], str(path))
+        load_parameters(self.averaged, state["averaged"], str(path))
         self.optimizer.load_state_dict(state["optimizer"])
         self.history = list(state["history"])
         return int(state["step"])
@@ -244,7 +245,7 @@ class _Run:
             figures = self.task.validate(self.averaged)
         self.history.append({"step": done, **figures})
         state = {
-            "format": FORMAT,
+            "format": TRAINING_FORMAT,
             "step": done,
             "settings": asdict(self.settings),
             "network": self.network.state_dict(),
@@ -271,11 +272,9 @@ class _Run:
 
     def _tensorboard(self) -> Any:
         if self._writer is None:
-            try:
-                from torch.utils.tensorboard import SummaryWriter
-            except ModuleNotFoundError:
-                raise MissingExtraError("tensorboard", "train", "training") from None
-            self._writer = SummaryWriter(str(self.folder / "tensorboard"))
+            from lcf3d.networks.torch import summary_writer
+
+            self._writer = summary_writer(self.folder / "tensorboard")
         return self._writer
 
     def close(self) -> None:
@@ -289,52 +288,9 @@ def import_torch() -> Any:
     Raises:
         MissingExtraError: torch is not installed.
     """
-    try:
-        import torch
-    except ModuleNotFoundError:
-        raise MissingExtraError("torch", "train", "training") from None
+    from lcf3d.networks.torch import torch
+
     return torch
-
-
-def load_checkpoint(path: Path) -> dict[str, Any]:
-    """The content of a ``last.pt``; no code in it is executed.
-
-    Raises:
-        DetectorError: the file is absent, damaged or no checkpoint of `train`.
-    """
-    torch = import_torch()
-    if not path.is_file():
-        raise DetectorError(f"training checkpoint {path} does not exist")
-    try:
-        state = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:
-        # torch raises errors of many unrelated classes for torn files
-        reason = str(error).splitlines()[0][:120] if str(error) else type(error).__name__
-        raise DetectorError(f"training checkpoint {path} is damaged ({reason})") from None
-    if not isinstance(state, dict) or state.get("format") != FORMAT:
-        raise DetectorError(f"{path} is no training checkpoint of lcf3d")
-    return state
-
-
-def fill(network: Any, state: dict[str, Any], source: str) -> None:
-    """Load parameters into a network of the same architecture.
-
-    Raises:
-        DetectorError: they are another network's; names the first parameter that does not fit.
-    """
-    expected = network.state_dict()
-    for name, value in expected.items():
-        if name not in state:
-            raise DetectorError(f"{source} is of another architecture: it has no parameter {name!r}")
-        if state[name].shape != value.shape:
-            raise DetectorError(
-                f"{source} is of another architecture: {name!r} has shape {tuple(state[name].shape)}, "
-                f"expected {tuple(value.shape)}"
-            )
-    extra = next((name for name in state if name not in expected), None)
-    if extra is not None:
-        raise DetectorError(f"{source} is of another architecture: it has a parameter {extra!r} that is not expected")
-    network.load_state_dict(state)
 
 
 def _seed(*parts: int) -> int:

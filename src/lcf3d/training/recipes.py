@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from lcf3d.errors import ConfigError
 from lcf3d.structures import Camera
@@ -84,3 +86,8 @@ def training_cameras(recipe: LocalizerRecipe) -> list[tuple[Camera, Camera | Non
     if preset.layout == "kitti":
         return [(preset.cameras[0], preset.cameras[1])]
     return [(camera, None) for camera in preset.cameras]
+
+
+def default_samples_root() -> Path:
+    """Where simulated samples are kept between trainings: ``lcf3d/samples`` in the user's cache folder."""
+    return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "lcf3d" / "samples"

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lcf3d.errors import ConfigError, FormatError, MissingExtraError
-from lcf3d.formats.files import atomic_path, read_json, write_json
+from lcf3d.files import atomic_path, read_json, write_json
 from lcf3d.structures import FloatArray, IntArray
 
 if TYPE_CHECKING:

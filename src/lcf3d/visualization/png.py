@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import PIL.Image
 
-from lcf3d.formats.files import atomic_path
+from lcf3d.files import atomic_path
 from lcf3d.structures import Camera, Frame
 from lcf3d.visualization.bev import BevView, draw_bev
 from lcf3d.visualization.camera_view import draw_camera

@@ -4,7 +4,7 @@ import sys
 import numpy as np
 import pytest
 
-from lcf3d.demo.shipped import read_drive
+from lcf3d.datasets.drive import read_drive
 from lcf3d.detectors.camera.small import MODELS, SHIPPED, shipped
 from lcf3d.errors import ConfigError
 from lcf3d.geometry.iou import image_iou

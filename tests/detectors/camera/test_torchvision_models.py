@@ -21,7 +21,7 @@ from lcf3d.detectors.camera.torchvision_models import (  # noqa: E402
     current_names,
 )
 from lcf3d.detectors.classes import COCO_CLASSES  # noqa: E402
-from lcf3d.detectors.specs import load_detector  # noqa: E402
+from lcf3d.detectors.named import load_detector  # noqa: E402
 from lcf3d.errors import ConfigError, DetectorError, MissingExtraError, ShapeError  # noqa: E402
 from lcf3d.structures import KITTI_CLASSES  # noqa: E402
 

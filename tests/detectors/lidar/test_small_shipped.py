@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lcf3d.demo.shipped import read_drive
+from lcf3d.datasets.drive import read_drive
 from lcf3d.detectors.lidar.kinds import shipped
 from lcf3d.structures import KITTI_CLASSES
 

@@ -21,12 +21,12 @@ from lcf3d.detectors.lidar.point_ops import (  # noqa: E402
 from lcf3d.detectors.lidar.roi import pool_in_regions, pooled_maximum, pooled_mean, region_grid  # noqa: E402
 from lcf3d.detectors.lidar.sparse import (  # noqa: E402
     InverseConv,
-    Sites,
     SparseBlock,
     SparseTensor,
     StridedConv,
     SubmanifoldConv,
 )
+from lcf3d.detectors.lidar.sparse_sites import Sites  # noqa: E402
 
 SHAPE = (7, 9, 8)
 

@@ -15,13 +15,13 @@ from lcf3d.detectors.lidar import sparse_spconv  # noqa: E402
 from lcf3d.detectors.lidar.fusing import fuse_batch_norm  # noqa: E402
 from lcf3d.detectors.lidar.sparse import (  # noqa: E402
     InverseConv,
-    Sites,
     SparseBlock,
     SparseTensor,
     StridedConv,
     SubmanifoldConv,
 )
 from lcf3d.detectors.lidar.sparse_encoders import SparseEncoder  # noqa: E402
+from lcf3d.detectors.lidar.sparse_sites import Sites  # noqa: E402
 from lcf3d.detectors.lidar.sparse_unet import SparseUNet  # noqa: E402
 from tests.detectors.lidar import spconv_stand_in  # noqa: E402
 

@@ -15,8 +15,8 @@ from lcf3d.detectors.camera.onnx_images import instance_masks, prepare_image
 from lcf3d.detectors.camera.onnx_layouts import LAYOUTS, SIZES_INPUT, class_count, identify_layout
 from lcf3d.detectors.camera.tiling import merge_tiles, non_maximum_suppression, tile_spans
 from lcf3d.detectors.classes import COCO_CLASSES, read_class_names, to_classes
-from lcf3d.detectors.onnx_session import first_line, open_session
 from lcf3d.errors import ConfigError, DetectorError, ShapeError
+from lcf3d.networks.onnx import first_line, open_session
 from lcf3d.structures import KITTI_CLASSES, Detections2D
 
 # input side for networks that leave it open and do not record it either

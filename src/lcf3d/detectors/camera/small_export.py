@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from lcf3d.detectors.camera.small_network import SmallDetector
-from lcf3d.detectors.lidar._torch import torch
 from lcf3d.errors import ConfigError, MissingExtraError
-from lcf3d.formats.files import atomic_path
+from lcf3d.files import atomic_path
+from lcf3d.networks.torch import torch
 from lcf3d.structures import KITTI_CLASSES
 
 OPSET = 17

@@ -14,8 +14,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from lcf3d.detectors.camera.onnx_layouts import STRIDES
-from lcf3d.detectors.lidar._torch import Tensor, functional, nn, torch
 from lcf3d.errors import ConfigError
+from lcf3d.networks.torch import Tensor, functional, nn, torch
 
 PROTOTYPE_STRIDE = 4
 # score of every cell before training: rare positives

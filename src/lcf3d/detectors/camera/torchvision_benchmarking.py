@@ -8,9 +8,9 @@ import numpy as np
 
 from lcf3d.detectors.base import Image
 from lcf3d.detectors.camera.torchvision_fasterrcnn import STYLES, FasterRCNNNetwork, TorchvisionFasterRCNN
-from lcf3d.detectors.lidar._torch import torch
 from lcf3d.detectors.lidar.benchmarking import Cost, count_gflops, cpu_threads, median_ms, peak_memory_mb
 from lcf3d.errors import ConfigError
+from lcf3d.networks.torch import torch
 
 NETWORKS = {"fasterrcnn-r101-kitti": (101, "kitti"), "fasterrcnn-r50-nuscenes": (50, "nuscenes")}
 """Name -> depth of the ResNet and style."""

@@ -8,8 +8,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from lcf3d.detectors.lidar._torch import Tensor, torch
 from lcf3d.geometry.iou import image_iou
+from lcf3d.networks.torch import Tensor, torch, torchvision
 from lcf3d.structures import FloatArray, IntArray
 
 MAX_BOXES = 100
@@ -43,15 +43,13 @@ def clip_boxes(boxes: Tensor, height: int, width: int) -> Tensor:
 
 def roi_features(maps: Sequence[Tensor], regions: Tensor, strides: Sequence[int]) -> Tensor:
     """(R, C, 7, 7) features of (R, 4) regions, each from the map of its size (FPN, equation 1)."""
-    from torchvision.ops import roi_align
-
     area = ((regions[:, 2] - regions[:, 0]) * (regions[:, 3] - regions[:, 1])).clamp(min=0)
     level = torch.floor(torch.log2(area.sqrt() / 56 + 1e-6)).clamp(0, len(maps) - 1)
     pooled = regions.new_zeros(len(regions), maps[0].shape[1], 7, 7)
     for i, values in enumerate(maps):
         chosen = torch.nonzero(level == i).squeeze(1)
         if len(chosen):
-            pooled[chosen] = roi_align(values, [regions[chosen]], 7, 1 / strides[i], aligned=True)
+            pooled[chosen] = torchvision().ops.roi_align(values, [regions[chosen]], 7, 1 / strides[i], aligned=True)
     return pooled
 
 

@@ -22,10 +22,10 @@ from lcf3d.detectors.camera.torchvision_boxes import (
     roi_features,
     select_detections,
 )
-from lcf3d.detectors.checkpoints import load_parameters, read_state_dict
 from lcf3d.detectors.classes import to_classes
-from lcf3d.detectors.lidar._torch import Tensor, functional, nn, torch, torch_device
-from lcf3d.errors import ConfigError, DetectorError, MissingExtraError, ShapeError
+from lcf3d.errors import ConfigError, DetectorError, ShapeError
+from lcf3d.networks.checkpoints import load_parameters, read_state_dict
+from lcf3d.networks.torch import Tensor, functional, nn, torch, torch_device, torchvision
 from lcf3d.structures import KITTI_CLASSES, Detections2D
 
 STRIDES = (4, 8, 16, 32, 64)
@@ -117,9 +117,7 @@ class Backbone(nn.Module):
 
     def __init__(self, depth: int, caffe: bool) -> None:
         super().__init__()
-        import torchvision
-
-        resnet = getattr(torchvision.models, f"resnet{depth}")(weights=None)
+        resnet = getattr(torchvision().models, f"resnet{depth}")(weights=None)
         for name in ("conv1", "bn1", "layer1", "layer2", "layer3", "layer4"):
             setattr(self, name, getattr(resnet, name))
         if caffe:
@@ -205,8 +203,6 @@ class FasterRCNNNetwork(nn.Module):
 
     def regions(self, maps: Sequence[Tensor], height: int, width: int) -> Tensor:
         """(R, 4) at most 1,000 proposals in pixels, best first."""
-        from torchvision.ops import batched_nms
-
         boxes, scores, levels = [], [], []
         for level, (logits, residuals) in enumerate(zip(*self.rpn_head(maps), strict=True)):
             objectness = logits[0].permute(1, 2, 0).reshape(-1).sigmoid()
@@ -220,7 +216,7 @@ class FasterRCNNNetwork(nn.Module):
         sides = all_boxes[:, 2:] - all_boxes[:, :2]
         valid = (sides > 0).all(dim=1)
         all_boxes, all_scores, all_levels = all_boxes[valid], all_scores[valid], all_levels[valid]
-        return all_boxes[batched_nms(all_boxes, all_scores, all_levels, 0.7)[:1000]]
+        return all_boxes[torchvision().ops.batched_nms(all_boxes, all_scores, all_levels, 0.7)[:1000]]
 
     def forward(self, image: Tensor, height: int, width: int) -> tuple[Tensor, Tensor]:
         """(R, K) scores and (R, K, 4) boxes of the regions of a padded (1, 3, H, W) image of height x width pixels."""
@@ -274,10 +270,7 @@ class TorchvisionFasterRCNN:
         style: str | None,
         device: str,
     ) -> None:
-        try:
-            import torchvision  # noqa: F401
-        except ModuleNotFoundError:
-            raise MissingExtraError("torchvision", "train", "Faster R-CNN") from None
+        torchvision()
         if style is not None and style not in STYLES:
             raise ConfigError(f"style must be one of {', '.join(STYLES)}, got {style!r}")
         self.style = STYLES[style] if style is not None else find_style(state)

@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lcf3d.detectors.base import Image
-from lcf3d.detectors.checkpoints import load_parameters, read_state_dict
 from lcf3d.detectors.classes import COCO_CLASSES, read_class_names, to_classes
-from lcf3d.detectors.lidar._torch import nn, torch, torch_device
-from lcf3d.errors import ConfigError, DetectorError, MissingExtraError, ShapeError
+from lcf3d.errors import ConfigError, DetectorError, ShapeError
+from lcf3d.networks.checkpoints import load_parameters, read_state_dict
+from lcf3d.networks.torch import nn, torch, torch_device, torchvision
 from lcf3d.structures import Detections2D, InstanceMask
 
 MODELS = (
@@ -124,7 +124,7 @@ def coco_parameters(name: str) -> dict[str, Any]:
         raise DetectorError(
             f"torchvision has no COCO weights for {name}; give a file of your own: torchvision:{name}?checkpoint=FILE"
         )
-    weights = _torchvision().models.get_model_weights(name).DEFAULT
+    weights = torchvision().models.get_model_weights(name).DEFAULT
     path = Path(torch.hub.get_dir()) / "checkpoints" / Path(weights.url).name
     if path.is_file():
         return read_state_dict(path)
@@ -153,7 +153,7 @@ def build_network(name: str, state: Mapping[str, Any], outputs: int, score_thres
     Raises:
         DetectorError: the parameters are of another network; the message names the first that differ.
     """
-    detection = _torchvision().models.detection
+    detection = torchvision().models.detection
     options = {"num_classes": outputs, "box_score_thresh": score_threshold}
     with torch.device("meta"):
         if name == WITHOUT_WEIGHTS:
@@ -189,7 +189,7 @@ def _current_name(name: str) -> str:
 
 def _freeze_normalization(body: nn.Module, eps: float) -> None:
     """Frozen batch normalization, as torchvision trains with pretrained backbones, in place of the one that learns."""
-    frozen = _torchvision().ops.misc.FrozenBatchNorm2d
+    frozen = torchvision().ops.misc.FrozenBatchNorm2d
     for parent in list(body.modules()):
         for name, child in list(parent.named_children()):
             if isinstance(child, nn.BatchNorm2d):
@@ -228,14 +228,6 @@ def _own_classes(
             f"{checkpoint} has {outputs - 1} classes (without background) and does not name them; name them with "
             "names=first,second,..."
         )
-    weights = _torchvision().models.get_model_weights("fasterrcnn_resnet50_fpn").DEFAULT
+    weights = torchvision().models.get_model_weights("fasterrcnn_resnet50_fpn").DEFAULT
     index = {name: i for i, name in enumerate(COCO_CLASSES)}
     return COCO_CLASSES, np.array([index.get(category, -1) for category in weights.meta["categories"]])
-
-
-def _torchvision() -> Any:
-    try:
-        import torchvision
-    except ModuleNotFoundError:
-        raise MissingExtraError("torchvision", "train", "a detector of torchvision") from None
-    return torchvision

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from lcf3d.detectors.lidar._torch import Tensor, functional, nn
+from lcf3d.networks.torch import Tensor, functional, nn
 
 
 def conv_bn_relu(conv: nn.Module, channels: int, eps: float = 1e-3) -> list[nn.Module]:

@@ -13,16 +13,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lcf3d.detectors.checkpoints import detector_class
-from lcf3d.detectors.lidar._torch import nn, torch
 from lcf3d.detectors.lidar.config import LidarConfig
 from lcf3d.detectors.lidar.detector import TorchLidarDetector
 from lcf3d.detectors.lidar.export import export_onnx
 from lcf3d.detectors.lidar.fusing import fuse_batch_norm
+from lcf3d.detectors.lidar.loading import detector_class
 from lcf3d.detectors.lidar.onnx import OnnxLidarDetector
 from lcf3d.detectors.lidar.pillars import PillarNetwork
 from lcf3d.detectors.lidar.presets import PRESETS
 from lcf3d.errors import ConfigError
+from lcf3d.networks.torch import count_flops, nn, torch
 
 
 @dataclass(frozen=True)
@@ -154,11 +154,7 @@ def median_ms(run: Callable[[], object], repeats: int, device: str) -> float:
 
 def count_gflops(run: Callable[[], object]) -> float:
     """Operations of convolutions and matrix products, a multiplication and an addition counted as two."""
-    from torch.utils.flop_counter import FlopCounterMode
-
-    with FlopCounterMode(display=False) as counter:
-        run()
-    return float(counter.get_total_flops()) / 1e9
+    return count_flops(run) / 1e9
 
 
 def peak_memory_mb(run: Callable[[], object], device: str) -> float | None:

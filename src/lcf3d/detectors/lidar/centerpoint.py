@@ -7,7 +7,6 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from lcf3d.detectors.lidar._torch import nn
 from lcf3d.detectors.lidar.backbones import SecondBackbone
 from lcf3d.detectors.lidar.config import LidarConfig
 from lcf3d.detectors.lidar.encoders import PillarFeatureNet
@@ -17,6 +16,7 @@ from lcf3d.detectors.lidar.necks import SecondFPN
 from lcf3d.detectors.lidar.pillars import PillarNetwork
 from lcf3d.detectors.lidar.sparse_encoders import SparseEncoder, sparse_shape
 from lcf3d.detectors.lidar.voxels import VoxelDetector, VoxelNetwork
+from lcf3d.networks.torch import nn
 
 
 class CenterPoint(VoxelDetector):

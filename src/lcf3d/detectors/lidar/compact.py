@@ -9,7 +9,6 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from lcf3d.detectors.lidar._torch import Tensor, nn
 from lcf3d.detectors.lidar.backbones import SecondBackbone
 from lcf3d.detectors.lidar.config import LidarConfig
 from lcf3d.detectors.lidar.detector import OneStageDetector
@@ -18,6 +17,7 @@ from lcf3d.detectors.lidar.heads import LightCenterHead
 from lcf3d.detectors.lidar.inputs import Inputs, encoder_inputs
 from lcf3d.detectors.lidar.necks import SecondFPN
 from lcf3d.detectors.lidar.statistics import FEATURES
+from lcf3d.networks.torch import Tensor, nn
 
 
 class CompactNetwork(nn.Module):

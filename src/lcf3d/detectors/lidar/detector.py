@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import Self
 
-from lcf3d.detectors.lidar._torch import Tensor, nn, torch, torch_device
 from lcf3d.detectors.lidar.config import LidarConfig
 from lcf3d.detectors.lidar.fusing import fuse_batch_norm
 from lcf3d.detectors.lidar.inputs import Inputs, map_detections, pillar_inputs
 from lcf3d.detectors.lidar.suppression import NmsMode, suppression_threshold
 from lcf3d.errors import ConfigError
+from lcf3d.networks.torch import Tensor, nn, torch, torch_device
 from lcf3d.structures import Detections3D
 
 
@@ -72,11 +72,11 @@ class TorchLidarDetector(ABC):
         Raises:
             DetectorError: names or shapes differ from the network's.
         """
-        from lcf3d.detectors.checkpoints import load_parameters
+        from lcf3d.detectors.lidar.loading import load_published
 
         with torch.device("meta"):
             network = cls.build(config)
-        load_parameters(network, state, config.name)
+        load_published(network, state, config.name)
         return cls(fuse_batch_norm(network.eval()), config, **options)
 
     @classmethod
@@ -91,7 +91,7 @@ class TorchLidarDetector(ABC):
         Raises:
             DetectorError: the file is damaged, or holds another network or number of classes.
         """
-        from lcf3d.detectors.checkpoints import read_lidar_checkpoint
+        from lcf3d.detectors.lidar.loading import read_lidar_checkpoint
 
         state, config = read_lidar_checkpoint(Path(path), preset, cls.architecture)
         return cls.from_state_dict(state, config, **options)

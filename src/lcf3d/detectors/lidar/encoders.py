@@ -8,7 +8,7 @@ the pillars that are not full. The result is the same, at a fraction of the work
 # mypy: allow-subclassing-any
 from __future__ import annotations
 
-from lcf3d.detectors.lidar._torch import Tensor, functional, nn, torch
+from lcf3d.networks.torch import Tensor, functional, nn, torch
 
 
 def pillar_maximum(features: Tensor, pillar: Tensor, padding: Tensor) -> Tensor:

@@ -6,7 +6,6 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from lcf3d.detectors.lidar._torch import Tensor, nn, torch
 from lcf3d.detectors.lidar.compact import CompactNetwork
 from lcf3d.detectors.lidar.config import LidarConfig
 from lcf3d.detectors.lidar.detector import TorchLidarDetector
@@ -15,7 +14,8 @@ from lcf3d.detectors.lidar.onnx import CONFIG_KEY
 from lcf3d.detectors.lidar.pillars import PillarNetwork
 from lcf3d.detectors.lidar.statistics import FEATURES
 from lcf3d.errors import DetectorError, MissingExtraError
-from lcf3d.formats.files import atomic_path
+from lcf3d.files import atomic_path
+from lcf3d.networks.torch import Tensor, nn, torch
 
 OPSET = 18
 """First version whose scatter can take a maximum."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from itertools import pairwise
 
-from lcf3d.detectors.lidar._torch import nn, torch
 from lcf3d.detectors.lidar.sparse import SparseConvolution
+from lcf3d.networks.torch import nn, torch
 
 _NORMS = (nn.BatchNorm1d, nn.BatchNorm2d)
 _LAYERS = (nn.Conv1d, nn.Conv2d, nn.ConvTranspose2d, nn.Linear, SparseConvolution)

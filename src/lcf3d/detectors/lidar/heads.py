@@ -5,9 +5,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from lcf3d.detectors.lidar._torch import Tensor, nn
 from lcf3d.detectors.lidar.backbones import ConvModule
 from lcf3d.detectors.lidar.config import AnchorSpec, CenterSpec
+from lcf3d.networks.torch import Tensor, nn
 
 AnchorMaps = list[tuple[Tensor, Tensor, Tensor]]
 CENTER_CHANNELS = {"reg": 2, "height": 1, "dim": 3, "rot": 2, "vel": 2}

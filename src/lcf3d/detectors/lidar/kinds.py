@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lcf3d.detectors.base import LidarDetector
-from lcf3d.detectors.checkpoints import detector_class, read_lidar_checkpoint
 from lcf3d.detectors.classes import class_mapping
 from lcf3d.detectors.lidar.suppression import NmsMode
 from lcf3d.errors import DetectorError
@@ -59,6 +58,8 @@ def load(
     Raises:
         DetectorError: the file cannot be read, or holds another network.
     """
+    from lcf3d.detectors.lidar.loading import detector_class, read_lidar_checkpoint
+
     state, config = read_lidar_checkpoint(Path(path), preset, architecture)
     options = {"nms": nms, "score_threshold": score_threshold, "device": device, "candidates": candidates}
     detector: LidarDetector = detector_class(config.architecture).from_state_dict(state, config, **options)

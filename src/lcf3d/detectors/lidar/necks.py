@@ -5,8 +5,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from lcf3d.detectors.lidar._torch import Tensor, functional, nn, torch
 from lcf3d.detectors.lidar.backbones import ConvModule, conv_bn_relu
+from lcf3d.networks.torch import Tensor, functional, nn, torch
 
 
 class SecondFPN(nn.Module):

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from lcf3d.detectors.lidar.config import LidarConfig
 from lcf3d.detectors.lidar.inputs import encoder_inputs, map_detections
 from lcf3d.detectors.lidar.suppression import NmsMode, suppression_threshold
-from lcf3d.detectors.onnx_session import open_session
 from lcf3d.errors import ConfigError, DetectorError
+from lcf3d.networks.onnx import open_session
 from lcf3d.structures import Detections3D
 
 CONFIG_KEY = "lcf3d.lidar_config"

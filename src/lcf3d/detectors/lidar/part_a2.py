@@ -10,7 +10,6 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from lcf3d.detectors.lidar._torch import Tensor, nn, torch
 from lcf3d.detectors.lidar.config import LidarConfig
 from lcf3d.detectors.lidar.decoding import detections, sigmoid
 from lcf3d.detectors.lidar.detector import TorchLidarDetector, to_arrays
@@ -26,12 +25,14 @@ from lcf3d.detectors.lidar.roi import (
     propose,
     refine,
 )
-from lcf3d.detectors.lidar.sparse import Sites, SparseBlock, SparseTensor, SubmanifoldConv, swap_table
+from lcf3d.detectors.lidar.sparse import SparseBlock, SparseTensor, SubmanifoldConv
 from lcf3d.detectors.lidar.sparse_encoders import sparse_shape
+from lcf3d.detectors.lidar.sparse_sites import Sites, swap_table
 from lcf3d.detectors.lidar.sparse_unet import SparseUNet
 from lcf3d.detectors.lidar.suppression import bev_nms, suppression_threshold
 from lcf3d.detectors.lidar.voxelization import voxelize
 from lcf3d.detectors.lidar.voxels import voxel_backbone
+from lcf3d.networks.torch import Tensor, nn, torch
 from lcf3d.structures import Detections3D, FloatArray
 
 GRID = 14

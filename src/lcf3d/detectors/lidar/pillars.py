@@ -6,9 +6,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from lcf3d.detectors.lidar._torch import Tensor, nn
 from lcf3d.detectors.lidar.config import LidarConfig
 from lcf3d.detectors.lidar.encoders import scatter_pillars
+from lcf3d.networks.torch import Tensor, nn
 
 
 class PillarNetwork(nn.Module):

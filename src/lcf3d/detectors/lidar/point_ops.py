@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from lcf3d.detectors.lidar._torch import Tensor, torch
+from lcf3d.networks.torch import Tensor, torch
 
 CHUNK = 4_000_000
 """Pairwise distances computed at once."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from lcf3d.detectors.lidar._torch import nn
 from lcf3d.detectors.lidar.backbones import SecondBackbone
 from lcf3d.detectors.lidar.config import LidarConfig
 from lcf3d.detectors.lidar.detector import PillarDetector
@@ -12,6 +11,7 @@ from lcf3d.detectors.lidar.encoders import HardVFE, PillarFeatureNet
 from lcf3d.detectors.lidar.heads import AnchorHead
 from lcf3d.detectors.lidar.necks import FPN, SecondFPN
 from lcf3d.detectors.lidar.pillars import PillarNetwork
+from lcf3d.networks.torch import nn
 
 
 class PointPillars(PillarDetector):

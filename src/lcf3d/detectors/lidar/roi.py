@@ -11,10 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lcf3d.detectors.lidar._torch import Tensor, nn, torch
 from lcf3d.detectors.lidar.config import LidarConfig
 from lcf3d.detectors.lidar.decoding import Map, decode_anchor_maps, decode_residuals, turn_by_direction
 from lcf3d.detectors.lidar.suppression import bev_nms
+from lcf3d.networks.torch import Tensor, nn, torch
 from lcf3d.structures import FloatArray, IntArray
 
 

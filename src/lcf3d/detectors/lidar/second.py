@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from lcf3d.detectors.lidar._torch import nn
 from lcf3d.detectors.lidar.config import LidarConfig
 from lcf3d.detectors.lidar.heads import AnchorHead
 from lcf3d.detectors.lidar.necks import SecondFPN
 from lcf3d.detectors.lidar.sparse_encoders import SparseEncoder, sparse_shape
 from lcf3d.detectors.lidar.voxels import VoxelDetector, VoxelNetwork
+from lcf3d.networks.torch import nn
 
 
 class SECOND(VoxelDetector):

@@ -5,9 +5,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from lcf3d.detectors.lidar._torch import Tensor, functional, nn, torch
 from lcf3d.detectors.lidar.backbones import ConvModule
 from lcf3d.detectors.lidar.point_ops import ball_query
+from lcf3d.networks.torch import Tensor, functional, nn, torch
 
 
 class SetAbstraction(nn.Module):

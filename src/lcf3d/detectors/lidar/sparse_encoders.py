@@ -5,17 +5,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from lcf3d.detectors.lidar._torch import Tensor, nn, torch
 from lcf3d.detectors.lidar.config import VoxelSpec
-from lcf3d.detectors.lidar.sparse import (
-    Sites,
-    SparseBlock,
-    SparseResidualBlock,
-    SparseTensor,
-    StridedConv,
-    SubmanifoldConv,
-    Triple,
-)
+from lcf3d.detectors.lidar.sparse import SparseBlock, SparseResidualBlock, SparseTensor, StridedConv, SubmanifoldConv
+from lcf3d.detectors.lidar.sparse_sites import Sites, Triple
+from lcf3d.networks.torch import Tensor, nn, torch
 
 _PADDINGS: tuple[Triple, ...] = ((1, 1, 1), (1, 1, 1), (0, 1, 1))
 """Of the three strided convolutions; the last does not pad the height, so that 41 cells become 2 in the end."""

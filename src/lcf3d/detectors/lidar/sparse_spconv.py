@@ -8,12 +8,10 @@ from __future__ import annotations
 
 from functools import cache
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from lcf3d.detectors.lidar._torch import Tensor, nn, torch
-
-if TYPE_CHECKING:
-    from lcf3d.detectors.lidar.sparse import Sites, StridedConv, Triple
+from lcf3d.detectors.lidar.sparse_sites import Sites, Triple
+from lcf3d.networks.torch import Tensor, nn, torch
 
 _STRIDED = "strided"
 """Under this name the sites that a strided convolution made keep how they were made, for the way back."""
@@ -52,7 +50,7 @@ def submanifold(library: Any, weight: Tensor, features: Tensor, sites: Sites) ->
 
 
 def strided(
-    library: Any, conv: StridedConv, features: Tensor, sites: Sites
+    library: Any, weight: Tensor, features: Tensor, sites: Sites, *, stride: Triple, padding: Triple
 ) -> tuple[Tensor, Tensor, Triple, dict[str, Any]]:
     """Features (M, out), cells (M, 4) and grid of the outputs wherever an input is reached, and how they were made.
 
@@ -60,14 +58,14 @@ def strided(
     """
     with torch.device("meta"):
         layer = library.SparseConv3d(
-            *conv.weight.shape[3:],
-            list(conv.kernel),
-            stride=list(conv.stride),
-            padding=list(conv.padding),
+            *weight.shape[3:],
+            list(weight.shape[:3]),
+            stride=list(stride),
+            padding=list(padding),
             bias=False,
             indice_key=_STRIDED,
         )
-    result = _run(layer, conv.weight, _tensor(library, features, sites, {}))
+    result = _run(layer, weight, _tensor(library, features, sites, {}))
     depth, height, width = (int(cells) for cells in result.spatial_shape)
     made = {_STRIDED: result.indice_dict[_STRIDED]}
     return _features(result), result.indices.long(), (depth, height, width), made

@@ -3,16 +3,10 @@
 # mypy: allow-subclassing-any
 from __future__ import annotations
 
-from lcf3d.detectors.lidar._torch import Tensor, torch
-from lcf3d.detectors.lidar.sparse import (
-    InverseConv,
-    SparseBlock,
-    SparseResidualBlock,
-    SparseTensor,
-    SubmanifoldConv,
-    Triple,
-)
+from lcf3d.detectors.lidar.sparse import InverseConv, SparseBlock, SparseResidualBlock, SparseTensor, SubmanifoldConv
 from lcf3d.detectors.lidar.sparse_encoders import SparseEncoder
+from lcf3d.detectors.lidar.sparse_sites import Triple
+from lcf3d.networks.torch import Tensor, torch
 
 
 class SparseUNet(SparseEncoder):

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lcf3d.detectors.lidar._torch import Tensor, nn
 from lcf3d.detectors.lidar.backbones import SecondBackbone
 from lcf3d.detectors.lidar.detector import OneStageDetector
 from lcf3d.detectors.lidar.inputs import Inputs, network_points, voxel_inputs
 from lcf3d.detectors.lidar.voxelization import voxelize
+from lcf3d.networks.torch import Tensor, nn
 
 
 class VoxelNetwork(nn.Module):

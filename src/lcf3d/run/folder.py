@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lcf3d.errors import ConfigError
-from lcf3d.formats.files import read_json, write_json
+from lcf3d.files import read_json, write_json
 from lcf3d.formats.kitti import objects_from_detections, write_objects
 from lcf3d.fusion.config import FusionConfig
 from lcf3d.geometry.camera import project_boxes

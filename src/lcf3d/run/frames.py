@@ -10,10 +10,10 @@ from multiprocessing import get_context
 from time import perf_counter
 from typing import Any, Protocol
 
-from lcf3d.detectors.sources import CameraSource, LidarSource
 from lcf3d.errors import DatasetError
-from lcf3d.formats.run_folder import RunFolder
 from lcf3d.provenance import FusedDetections, Reason, Stage
+from lcf3d.run.folder import RunFolder
+from lcf3d.run.sources import CameraSource, LidarSource
 from lcf3d.structures import Detections2D, Detections3D, Frame
 
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lcf3d.demo.shipped import (
+from lcf3d.datasets.drive import (
     DRIVE,
     Distractors,
     Objects,

@@ -23,7 +23,7 @@ from PIL import Image
 from lcf3d.errors import FormatError
 from lcf3d.structures import Camera, FloatArray, IntArray
 
-DRIVE = Path(__file__).parent / "data" / "drive.zip"
+DRIVE = Path(__file__).parents[1] / "demo" / "data" / "drive.zip"
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +92,7 @@ def write_drive(path: Path, frames: Sequence[ShippedFrame], made_by: str, qualit
         made_by: the command that makes the archive, kept in it.
         quality: of the WebP images.
     """
-    from lcf3d.formats.files import atomic_path
+    from lcf3d.files import atomic_path
 
     camera = frames[0].camera
     about = {

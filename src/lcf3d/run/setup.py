@@ -9,24 +9,25 @@ from typing import Any, NamedTuple
 
 import typer
 
-from lcf3d.cli.options import build_config
 from lcf3d.datasets.kitti import KittiDataset
 from lcf3d.datasets.nuscenes import NuscenesDataset
 from lcf3d.datasets.nuscenes_tables import CAMERAS as NUSCENES_CAMERAS
 from lcf3d.datasets.opening import parse_dataset
-from lcf3d.detectors.results import KittiResults, NuscenesCameraResults, NuscenesLidarResults
-from lcf3d.detectors.sources import CameraOnImages, CameraSource, LidarOnScans, LidarSource
-from lcf3d.detectors.specs import load_detector, parse_spec
+from lcf3d.detectors.named import load_detector
 from lcf3d.errors import ConfigError, DatasetError
-from lcf3d.formats.run_folder import KittiRunFolder, NuscenesRunFolder, RunFolder
 from lcf3d.fusion.calibration import Calibration, load_calibration
 from lcf3d.fusion.config import FusionConfig
+from lcf3d.fusion.localizer import Localizer
 from lcf3d.fusion.pipeline import LateCascadeFusion
 from lcf3d.fusion.self_calibration import self_calibrate
 from lcf3d.fusion.stereo import StereoConfig, StereoLateCascadeFusion
-from lcf3d.localizers.base import Localizer
 from lcf3d.localizers.named import load_localizer
-from lcf3d.runner import FrameRunner
+from lcf3d.plugins import parse as parse_spec
+from lcf3d.run.folder import KittiRunFolder, NuscenesRunFolder, RunFolder
+from lcf3d.run.frames import FrameRunner
+from lcf3d.run.results import KittiResults, NuscenesCameraResults, NuscenesLidarResults
+from lcf3d.run.settings import build_config
+from lcf3d.run.sources import CameraOnImages, CameraSource, LidarOnScans, LidarSource
 
 Dataset = KittiDataset | NuscenesDataset
 
@@ -51,7 +52,7 @@ class RunRequest:
     config: str | None = None
     changes: tuple[str, ...] = ()
     recovery: str | None = None
-    localizer: str = "hybrid"
+    localizer: str = "geometric"
     tiles: int = 1
     calibration: str = "auto"
     missing: str = "error"

@@ -12,16 +12,12 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from lcf3d.detectors.checkpoints import (  # noqa: E402
-    detector_class,
-    find_config,
-    load_parameters,
-    read_state_dict,
-)
 from lcf3d.detectors.lidar import PointPillars, load  # noqa: E402
+from lcf3d.detectors.lidar.loading import detector_class, find_config, load_published  # noqa: E402
 from lcf3d.detectors.lidar.presets import PRESETS  # noqa: E402
 from lcf3d.detectors.openpcdet import translate  # noqa: E402
 from lcf3d.errors import ConfigError, DetectorError  # noqa: E402
+from lcf3d.networks.checkpoints import read_state_dict  # noqa: E402
 
 
 def meta_state(preset):
@@ -52,7 +48,7 @@ def test_weights_in_the_layout_of_spconv_2_are_turned():
     turned = {name: v.permute(4, 0, 1, 2, 3).contiguous() if v.ndim == 5 else v for name, v in state.items()}
     assert find_config(turned).name == "second-kitti"
     network = detector_class("second").build(config)
-    load_parameters(network, turned, "second")
+    load_published(network, turned, "second")
     assert all(torch.equal(a, b) for a, b in zip(network.state_dict().values(), state.values(), strict=True))
 
 
@@ -145,7 +141,7 @@ def test_parameters_of_a_failed_training(pointpillars_file, tmp_path):
     state = torch.load(pointpillars_file, weights_only=True)["state_dict"]
     state["backbone.blocks.0.0.weight"][0, 0, 0, 0] = float("nan")
     torch.save(state, tmp_path / "nan.pth")
-    with pytest.raises(DetectorError, match=r"parameter backbone\.blocks\.0\.0\.weight .* is NaN"):
+    with pytest.raises(DetectorError, match=r"parameter backbone\.blocks\.0\.0\.weight is NaN"):
         load(str(tmp_path / "nan.pth"))
 
 

@@ -1,0 +1,1 @@
+"""The one place that imports torch and onnxruntime: sessions, inert checkpoint reading, parameter filling."""
