@@ -27,8 +27,8 @@ from lcf3d.provenance import FusedDetections
 from lcf3d.run.results import NuscenesCameraResults, NuscenesLidarResults
 from lcf3d.structures import NUSCENES_CLASSES, Detections2D, Detections3D, Frame
 
-# the weights that the kitti preset has for people, without the rival, for every class
-_EVIDENCE = Evidence(base=-1.0, trust=1.0, support=(2.5, 4.5, 6.0, 6.0), miss=0.3, off_ground=0.0, rival=0.0)
+# the weights that the kitti preset has for people, without the competing, for every class
+_EVIDENCE = Evidence(base=-1.0, trust=1.0, support=(2.5, 4.5, 6.0, 6.0), miss=0.3, off_ground=0.0, competing=0.0)
 START: dict[str, Any] = {
     "recovery": False,
     "class_names": NUSCENES_CLASSES,

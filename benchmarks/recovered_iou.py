@@ -13,7 +13,7 @@ import numpy as np
 
 from lcf3d.datasets.kitti import KittiDataset
 from lcf3d.geometry.iou import bev_iou, iou_3d
-from lcf3d.provenance import Reason, Stage
+from lcf3d.provenance import Reason, Outcome
 from lcf3d.run.folder import KittiRunFolder
 
 # Van and Person_sitting are neighbours of Car and Pedestrian: a box on one of them is no mistake
@@ -29,17 +29,17 @@ def main() -> None:
     dataset, folder = KittiDataset(arguments.root, class_names=CLASSES), KittiRunFolder(arguments.run)
     for path in sorted((arguments.run / "provenance").glob("*.json")):
         fused, frame = folder.read(path.stem), dataset.frame(path.stem)
-        counts = np.bincount(fused.stages, minlength=4)
-        reasons = [Reason(r).name.lower() for r in fused.camera.reason[fused.camera.stage == Stage.DROPPED]]
+        counts = np.bincount(fused.outcomes, minlength=4)
+        reasons = [Reason(r).name.lower() for r in fused.camera.reason[fused.camera.outcome == Outcome.DROPPED]]
         print(
-            f"{path.stem}: matched {counts[Stage.MATCHED]}, recovered {counts[Stage.RECOVERED]}, "
-            f"kept {counts[Stage.KEPT]}, LiDAR dropped {len(fused.dropped_lidar)}; 2D detections without a box: "
+            f"{path.stem}: matched {counts[Outcome.MATCHED]}, recovered {counts[Outcome.RECOVERED]}, "
+            f"kept {counts[Outcome.KEPT]}, LiDAR dropped {len(fused.dropped_lidar)}; 2D detections without a box: "
             + (", ".join(f"{reasons.count(r)} {r}" for r in sorted(set(reasons) - {"low_score"})) or "none")
         )
         labels = frame.labels
         if labels is None or not len(labels):
             continue
-        for i in np.flatnonzero(fused.stages == Stage.RECOVERED):
+        for i in np.flatnonzero(fused.outcomes == Outcome.RECOVERED):
             box = fused.detections.boxes[[i]]
             flat, solid = bev_iou(box, labels.boxes)[0], iou_3d(box, labels.boxes)[0]
             near = np.hypot(*(labels.boxes[:, :2] - box[0, :2]).T)

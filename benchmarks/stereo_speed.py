@@ -80,7 +80,7 @@ def main() -> None:
                 if repeat:
                     times[name].append(time.perf_counter() - begin)
                 else:
-                    outputs[name] += int((fused.stages == 1).sum())
+                    outputs[name] += int((fused.outcomes == 1).sum())
     medians = {name: float(np.median(values)) * 1e3 for name, values in times.items()}
     if options.json:
         print(json.dumps({"median_ms": medians, "recovered": outputs}, indent=2))

@@ -39,6 +39,10 @@ GROUPS = {
 """Group of entry points -> what its kinds are called in messages."""
 
 
+# what a string cannot give: parameters of these types are for Python only
+_COMPOSED = re.compile(r"\b(Sequence|Mapping|Callable|tuple|list|dict|set|Tables|NuscenesTables|NDArray|FloatArray)\b")
+
+
 @dataclass(frozen=True)
 class Spec:
     """A parsed string.
@@ -103,7 +107,8 @@ def build(
         have = ", ".join(sorted(set(known or ()) - set(passed))) or "none"
         raise ConfigError(f"{GROUPS[group]} kind {spec.kind!r} has no setting {name!r}; its settings: {have}")
     given = {name: _fitted(group, spec.kind, name, value, call) for name, value in given.items()}
-    given.update({name: value for name, value in passed.items() if known is None or name in known})
+    taken = inspect.signature(call).parameters
+    given.update({name: value for name, value in passed.items() if known is None or name in taken})
     return call(*_arguments(group, spec, call), **given)
 
 
@@ -138,14 +143,15 @@ def kinds(group: str) -> dict[str, str]:
 
 
 def settings_of(call: Any) -> set[str] | None:
-    """Names of the keyword settings of a kind's callable, None if it takes any."""
+    """Names of the keyword settings of a kind's callable that a string can give, None if it takes any."""
     parameters = list(inspect.signature(call).parameters.values())
     if any(p.kind is p.VAR_KEYWORD for p in parameters):
         return None
     # what a partial has bound is part of the kind, not a setting
     bound = call.keywords if isinstance(call, partial) else {}
     first = {p.name for p in parameters[:1] if _is_argument(p)}
-    return {p.name for p in parameters if p.kind is not p.VAR_POSITIONAL} - first - set(bound)
+    plain = {p.name for p in parameters if p.kind is not p.VAR_POSITIONAL and not _COMPOSED.search(str(p.annotation))}
+    return plain - first - set(bound)
 
 
 def _is_argument(parameter: inspect.Parameter) -> bool:

@@ -12,8 +12,8 @@ import numpy as np
 from lcf3d.structures import Detections2D, Detections3D, FloatArray, IntArray
 
 
-class Stage(IntEnum):
-    """Where in the fusion an input was decided."""
+class Outcome(IntEnum):
+    """What became of an input, or why an output is there."""
 
     MATCHED = 0
     RECOVERED = 1
@@ -44,7 +44,7 @@ class Reason(IntEnum):
     NO_SCAN = 17
     OTHER_VIEW = 18
     INVALID = 19
-    NOT_JUDGED = 20
+    CLASS_NOT_DETECTED = 20
     SECOND_VIEW = 21
     UNPAIRED = 22
     POOR_FIT = 23
@@ -71,19 +71,21 @@ REASON_TEXT = {
     Reason.NO_RECOVERY: "no LiDAR box matches it and recovery is off",
     Reason.NO_SCAN: "no LiDAR box matches it and there is no scan to recover it from",
     Reason.OTHER_VIEW: "its object is matched better in another camera",
-    Reason.NOT_JUDGED: "the camera detector does not detect its class",
+    Reason.CLASS_NOT_DETECTED: "the camera detector does not detect its class",
     Reason.INVALID: "its box is not finite or has no size",
     Reason.SECOND_VIEW: "it confirms the cluster beside the more confident view of its stereo pair",
     Reason.UNPAIRED: "no LiDAR box matches it, and no detection of its stereo pair's other view shows the same object",
 }
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class Decisions:
     """One row an input, in the order of the inputs; -1 and NaN stand for none.
 
+    The stages of the fusion fill the columns; in `FusedDetections` they are read-only.
+
     Attributes:
-        stage: `Stage` codes.
+        outcome: `Outcome` codes.
         reason: `Reason` codes.
         cluster: cluster of the LiDAR box, or of the LiDAR box that a camera detection matched.
         lidar: index of the LiDAR detection (for camera rows: of the representative it matched).
@@ -98,7 +100,7 @@ class Decisions:
         pair: row of the camera table with the other view's detection of the same object, where a stereo pair has two.
     """
 
-    stage: IntArray
+    outcome: IntArray
     reason: IntArray
     cluster: IntArray
     lidar: IntArray
@@ -117,7 +119,7 @@ class Decisions:
         """``n`` rows of dropped inputs, all else unset; the fusion fills its columns."""
         none, nan = np.full(n, -1, dtype=np.int64), np.full(n, np.nan)
         return cls(
-            stage=np.full(n, Stage.DROPPED, dtype=np.int64),
+            outcome=np.full(n, Outcome.DROPPED, dtype=np.int64),
             reason=np.full(n, Reason.LOW_SCORE, dtype=np.int64),
             cluster=none.copy(),
             lidar=none.copy(),
@@ -133,12 +135,17 @@ class Decisions:
         )
 
     def __len__(self) -> int:
-        return len(self.stage)
+        return len(self.outcome)
+
+    def freeze(self) -> None:
+        """Make all columns read-only: what was decided stays."""
+        for column in fields(self):
+            getattr(self, column.name).flags.writeable = False
 
     def row(self, index: int) -> dict[str, Any]:
         """One row in words and numbers, None where unset."""
         result: dict[str, Any] = {
-            "stage": Stage(self.stage[index]).name.lower(),
+            "outcome": Outcome(self.outcome[index]).name.lower(),
             "reason": Reason(self.reason[index]).name.lower(),
         }
         for name in ("cluster", "lidar", "camera", "detection", "output", "pair"):
@@ -154,8 +161,10 @@ class Decisions:
         """The inverse of `row` over all rows."""
         decisions = cls.blank(len(rows))
         for i, row in enumerate(rows):
-            decisions.stage[i] = Stage[row["stage"].upper()]
-            decisions.reason[i] = Reason[row["reason"].upper()]
+            # lcf3d 0.1 wrote "stage", and another word for a class that the camera does not detect
+            decisions.outcome[i] = Outcome[row["outcome" if "outcome" in row else "stage"].upper()]
+            reason = row["reason"].upper()
+            decisions.reason[i] = Reason["CLASS_NOT_DETECTED" if reason == "NOT_JUDGED" else reason]
             for column in fields(cls)[2:]:
                 # provenance written before a column existed lacks it
                 if row.get(column.name) is not None:
@@ -185,23 +194,27 @@ class FusedDetections:
     camera_names: tuple[str, ...]
     notes: tuple[str, ...] = ()
 
+    def __post_init__(self) -> None:
+        for table in (self.lidar, self.camera):
+            table.freeze()
+
     def __len__(self) -> int:
         return len(self.detections)
 
     @property
-    def stages(self) -> IntArray:
-        """(N,) `Stage` of every output."""
-        stages = np.full(len(self.detections), Stage.KEPT, dtype=np.int64)
+    def outcomes(self) -> IntArray:
+        """(N,) `Outcome` of every output."""
+        outcomes = np.full(len(self.detections), Outcome.KEPT, dtype=np.int64)
         for table in (self.camera, self.lidar):
             led = table.output >= 0
-            stages[table.output[led]] = table.stage[led]
-        return stages
+            outcomes[table.output[led]] = table.outcome[led]
+        return outcomes
 
     @property
     def dropped_lidar(self) -> IntArray:
         """Indices of the LiDAR detections that were dropped, without those that another box of theirs represents."""
         merged = np.isin(self.lidar.reason, [Reason.IN_CLUSTER, Reason.SUPPRESSED])
-        return np.flatnonzero((self.lidar.stage == Stage.DROPPED) & ~merged)
+        return np.flatnonzero((self.lidar.outcome == Outcome.DROPPED) & ~merged)
 
     def explain(self, output: int) -> str:
         """One sentence on why output ``output`` is there, with the numbers that decided."""
@@ -221,7 +234,7 @@ class FusedDetections:
         return f"{found.class_names[found.labels[index]]} {found.scores[index]:.2f}, {self._because(self.camera, row)}"
 
     def _because(self, table: Decisions, row: int) -> str:
-        """Stage, reason, and where a row comes from, in words."""
+        """Outcome, reason, and where a row comes from, in words."""
         parts = []
         if table.lidar[row] >= 0:
             parts.append(f"LiDAR detection {table.lidar[row]} (score {table.lidar_score[row]:.2f})")
@@ -232,8 +245,8 @@ class FusedDetections:
         overlap = "" if np.isnan(table.iou[row]) else f", image IoU {table.iou[row]:.2f}"
         if not np.isnan(table.quality[row]):
             overlap += f", fit {table.quality[row]:.2f}"
-        stage = Stage(table.stage[row]).name.lower()
-        return f"{stage}: {REASON_TEXT[Reason(table.reason[row])]}; from {' and '.join(parts)}{overlap}"
+        outcome = Outcome(table.outcome[row]).name.lower()
+        return f"{outcome}: {REASON_TEXT[Reason(table.reason[row])]}; from {' and '.join(parts)}{overlap}"
 
     def _camera_text(self, table: Decisions, row: int) -> str:
         """The 2D detection of a row in words."""

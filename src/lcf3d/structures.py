@@ -260,6 +260,11 @@ class Detections2D:
             masks = tuple(masks[i] for i in np.arange(len(masks))[index])
         return Detections2D(self.boxes[index], self.scores[index], self.labels[index], self.class_names, masks)
 
+    def clipped(self, camera: Camera) -> Detections2D:
+        """The same with boxes cut to the camera's image."""
+        limits = np.array([camera.width, camera.height, camera.width, camera.height], dtype=np.float64)
+        return replace(self, boxes=np.clip(self.boxes, 0, limits))
+
     def with_classes(self, class_names: Sequence[str], mapping: Mapping[str, str] | None = None) -> Detections2D:
         """The same detections with labels of ``class_names``; those of classes that map to none are dropped.
 
@@ -280,6 +285,9 @@ class Frame:
         cameras: the calibrated cameras, of different names.
         images: (H, W, 3) uint8 RGB image by camera name (a mapping that may load on access); cameras may be missing.
         labels: ground truth (scores 1), a function that returns it, or None.
+        timestamp: moment of the scan in seconds, of any clock that the frames of a drive share; None if unknown.
+        world_from_lidar: (4, 4) pose of the LiDAR frame in a frame that does not move; None if unknown.
+        sequence: name of the drive that the frame is a moment of; None if it stands alone.
     """
 
     def __init__(
@@ -289,8 +297,16 @@ class Frame:
         cameras: Sequence[Camera] = (),
         images: Mapping[str, NDArray[np.uint8]] | None = None,
         labels: Detections3D | Callable[[], Detections3D] | None = None,
+        timestamp: float | None = None,
+        world_from_lidar: FloatArray | None = None,
+        sequence: str | None = None,
     ) -> None:
         self.id = id
+        self.timestamp = timestamp
+        self.sequence = sequence
+        self.world_from_lidar = (
+            None if world_from_lidar is None else _array(world_from_lidar, np.float64, (4, 4), "Frame.world_from_lidar")
+        )
         self.cameras = tuple(cameras)
         self.images: Mapping[str, NDArray[np.uint8]] = {} if images is None else images
         self._points = points

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
 from lcf3d.cli.eval_nuscenes import eval_nuscenes
+
 from lcf3d.datasets.nuscenes import NuscenesDataset
 from lcf3d.errors import ConfigError, FormatError
 from lcf3d.formats.nuscenes import write_submission

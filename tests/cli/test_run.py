@@ -9,7 +9,7 @@ from lcf3d.errors import Lcf3dError
 from lcf3d.formats.kitti import objects_from_detections_2d, read_objects, write_objects
 from lcf3d.geometry.camera import project_boxes
 from lcf3d.localizers.named import SHIPPED
-from lcf3d.provenance import Stage
+from lcf3d.provenance import Outcome
 from lcf3d.run.folder import RunFolder
 from lcf3d.structures import KITTI_CLASSES, Detections2D
 from tests.datasets.kitti_folder import LABELS, make_kitti, make_results
@@ -240,7 +240,7 @@ def test_the_localizer_can_be_chosen(paths, tmp_path):
         run({**paths, "out": out}, "--localizer", name, "--set", "min_quality=0", "--set", "confirm_iou=0", *jobs)
         assert json.loads((out / "run.json").read_text())["localizer"] == name
         recovered[name] = RunFolder(out).read("000000")
-    boxes = [fused.detections.boxes[fused.stages == Stage.RECOVERED] for fused in recovered.values()]
+    boxes = [fused.detections.boxes[fused.outcomes == Outcome.RECOVERED] for fused in recovered.values()]
     assert [len(b) for b in boxes] == [1, 1, 1]
     assert np.abs(boxes[0] - boxes[1]).max() > 1e-6
     np.testing.assert_allclose(boxes[1], boxes[2], atol=1e-5)

@@ -15,7 +15,7 @@ from lcf3d.datasets.nuscenes_tables import CAMERAS
 from lcf3d.formats.coco import encode_mask
 from lcf3d.formats.nuscenes import read_submission
 from lcf3d.geometry.camera import project_boxes
-from lcf3d.provenance import Stage
+from lcf3d.provenance import Outcome
 from lcf3d.run.folder import RunFolder
 from lcf3d.structures import NUSCENES_CLASSES, Detections3D, Frame
 from tests.fusion.scenes import camera, surface_points
@@ -202,7 +202,7 @@ def test_without_any_camera_in_time_the_lidar_stands_alone(world: World) -> None
 
     world.change("sample_data", edit)
     fused = world.run().read(world.tokens["a"])
-    assert fused.stages.tolist() == [Stage.KEPT, Stage.KEPT]
+    assert fused.outcomes.tolist() == [Outcome.KEPT, Outcome.KEPT]
     assert fused.detections.scores.tolist() == [0.7, 0.6]
     assert sum("nobody looked there" in note for note in fused.notes) == 6
 
@@ -365,7 +365,7 @@ def test_six_real_images_and_their_scan_give_boxes_without_any_lidar_detector(sh
     folder = real_run(shared, tmp_path, "--camera", f"onnx:{weights}", "--tiles", "2", "--pictures")
     fused = folder.read(DEMO)
     assert set(fused.camera_names) == set(CAMERAS)
-    assert set(fused.stages.tolist()) == {Stage.RECOVERED}
+    assert set(fused.outcomes.tolist()) == {Outcome.RECOVERED}
     # measured: 5 of 14 lie within half a metre of an annotation of their class, among them the most certain ones
     distances = center_distances(folder, shared)
     assert (distances < 0.5).sum() >= 4

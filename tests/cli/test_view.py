@@ -12,7 +12,7 @@ from lcf3d.cli.app import app
 from lcf3d.datasets.kitti import KittiDataset
 from lcf3d.errors import ConfigError, DatasetError
 from lcf3d.fusion.config import FusionConfig
-from lcf3d.provenance import Decisions, FusedDetections, Reason, Stage
+from lcf3d.provenance import Decisions, FusedDetections, Outcome, Reason
 from lcf3d.run.folder import RunFolder
 from lcf3d.structures import KITTI_CLASSES, Detections2D, Detections3D
 from lcf3d.visualization.scene import COLOURS
@@ -48,7 +48,7 @@ def run_folder(kitti: Path, tmp_path: Path) -> Path:
     lidar = Detections3D(np.array([[10, 0, 0, 4, 2, 1.5, 0]]), np.array([0.9]), np.array([0]), KITTI_CLASSES)
     camera = Detections2D(np.array([[180, 40, 220, 80]]), np.array([0.9]), np.array([0]), KITTI_CLASSES)
     table = Decisions.blank(1)
-    table.stage[0], table.reason[0], table.output[0] = Stage.MATCHED, Reason.CONFIRMED, 0
+    table.outcome[0], table.reason[0], table.output[0] = Outcome.MATCHED, Reason.CONFIRMED, 0
     table.lidar[0] = table.camera[0] = table.detection[0] = 0
     for frame in dataset:
         folder.write(frame, FusedDetections(lidar, table, table, lidar, (camera,), ("left",)))

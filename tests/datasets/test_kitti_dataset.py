@@ -3,7 +3,7 @@ import pytest
 from PIL import Image
 
 from lcf3d.datasets.kitti import KittiDataset, read_calibration, read_points
-from lcf3d.datasets.opening import parse_dataset
+from lcf3d.datasets.opening import named, open_dataset
 from lcf3d.errors import Lcf3dError
 from tests.datasets.kitti_folder import CAMERA_FROM_LIDAR, LABELS, OBJECTS, P2, SIZE, make_kitti
 
@@ -76,7 +76,8 @@ def test_malformed_calibration(tmp_path, change, message):
 def test_missing_calibration_is_found_before_any_work(root):
     (root / "training" / "calib" / "000001.txt").unlink()
     with pytest.raises(Lcf3dError, match=r"lacks 1 of 3 frames, first 000001.txt"):
-        KittiDataset(root, "val").require_calibrations()
+        data = KittiDataset(root, "val")
+        data.require_complete(data.ids)
 
 
 def test_bad_scans(tmp_path):
@@ -108,17 +109,17 @@ def test_unknown_split(root, split, message):
 
 
 def test_dataset_strings(root, tmp_path):
-    assert parse_dataset(f"kitti:{root}") == ("kitti", root)
-    assert parse_dataset(str(root)) == ("kitti", root)
+    assert open_dataset(f"kitti:{root}").root == root
+    assert named(str(root)).kind == "kitti"
     (tmp_path / "n" / "v1.0-mini").mkdir(parents=True)
-    assert parse_dataset(str(tmp_path / "n"))[0] == "nuscenes"
+    assert named(str(tmp_path / "n")).kind == "nuscenes"
     for text, message in (
         (f"waymo:{root}", "unknown dataset kind 'waymo'"),
         (str(tmp_path), "cannot tell what dataset"),
         ("kitti:/nowhere", "does not exist"),
     ):
         with pytest.raises(Lcf3dError, match=message):
-            parse_dataset(text)
+            open_dataset(text)
 
 
 @pytest.mark.real

@@ -8,7 +8,7 @@ from lcf3d.cli.app import app
 from lcf3d.datasets.drive import read_drive
 from lcf3d.demo.drive import FULL, LIDAR_ALONE, VARIANTS, drive, ground_truth, measure, shipped_detectors
 from lcf3d.geometry.boxes import points_in_boxes
-from lcf3d.provenance import Stage
+from lcf3d.provenance import Outcome
 
 
 @pytest.fixture(scope="module")
@@ -26,8 +26,8 @@ def test_ground_truth_has_returns_and_three_classes():
 
 def test_both_networks_find_things_and_every_stage_takes_part(driven):
     assert all(len(item.lidar) > 0 and len(item.camera["left"]) > 0 for item in driven)
-    stages = np.concatenate([item.fused.stages for item in driven])
-    assert {Stage.MATCHED, Stage.RECOVERED} <= set(stages.tolist())
+    outcomes = np.concatenate([item.fused.outcomes for item in driven])
+    assert {Outcome.MATCHED, Outcome.RECOVERED} <= set(outcomes.tolist())
     assert all(set(item.milliseconds) == set(driven[0].milliseconds) for item in driven)
 
 

@@ -2,9 +2,10 @@ import numpy as np
 import pytest
 
 from lcf3d import FusionConfig
-from lcf3d.cli.calibrate import open_study
 from lcf3d.evaluation.ablation import MODULES, AblationInput, ablate, suppressed, variants
+from lcf3d.evaluation.calibration_study import open_study
 from lcf3d.fusion.self_calibration import self_calibrate
+from lcf3d.run.setup import RunRequest
 from lcf3d.structures import KITTI_CLASSES, Detections3D
 from tests.evaluation.drive import write_drive
 
@@ -15,9 +16,13 @@ CONFIG = FusionConfig.preset("kitti")
 def rows(tmp_path_factory):
     root = tmp_path_factory.mktemp("drive")
     lidar, camera = write_drive(root, 30)
-    study = open_study(f"kitti:{root}", "val", f"results:{lidar}", f"results:{camera}", CONFIG, folds=0, quiet=True)
+    study = open_study(
+        RunRequest(f"kitti:{root}", f"results:{lidar}", {"*": f"results:{camera}"}, "val", config="kitti"), folds=0
+    )
     inputs = [AblationInput(*i) for i in zip(study.frames, study.lidar_inputs, study.camera_inputs, strict=True)]
-    return {(row.group, row.name): row for row in ablate(inputs, study.truth, CONFIG, self_calibrate(inputs, CONFIG))}
+    return {
+        (row.group, row.name): row for row in ablate(inputs, study.evaluation, CONFIG, self_calibrate(inputs, CONFIG))
+    }
 
 
 def test_lidar_alone_and_the_filter(rows):

@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 
 from lcf3d import FusionConfig, Lcf3dError
-from lcf3d.cli.calibrate import open_study
-from lcf3d.evaluation.calibration_study import CalibrationStudy
-from lcf3d.formats.kitti import KittiFrames, KittiObjects
+from lcf3d.evaluation.calibration_study import CalibrationStudy, open_study
+from lcf3d.run.setup import RunRequest
+from lcf3d.structures import Detections3D
 from tests.evaluation.drive import CAR, CYCLIST, write_drive
 
 CONFIG = FusionConfig.preset("kitti")
@@ -14,7 +14,9 @@ CONFIG = FusionConfig.preset("kitti")
 def study(tmp_path_factory):
     root = tmp_path_factory.mktemp("drive")
     lidar, camera = write_drive(root, 60)
-    return open_study(f"kitti:{root}", "val", f"results:{lidar}", f"results:{camera}", CONFIG, folds=3, quiet=True)
+    return open_study(
+        RunRequest(f"kitti:{root}", f"results:{lidar}", {"*": f"results:{camera}"}, "val", config="kitti"), folds=3
+    )
 
 
 @pytest.fixture(scope="module")
@@ -67,9 +69,9 @@ def test_other_frames_only(study, calibration):
 
 
 def test_results_without_3d_boxes_are_refused(study):
-    empty = KittiFrames.from_frames(study.truth.frame_ids, [KittiObjects.empty(results=True)] * 60)
+    empty = [Detections3D.empty(CONFIG.class_names)] * 60
     with pytest.raises(Lcf3dError, match="no 3D boxes"):
-        CalibrationStudy(study.frames, study.truth, empty, study.camera_results, CONFIG, study.folds)
+        CalibrationStudy(study.frames, study.evaluation, empty, study.camera_inputs, CONFIG, study.folds)
 
 
 @pytest.mark.real

@@ -11,7 +11,7 @@ from shapely.geometry import Polygon, box
 
 from lcf3d.evaluation.curves import precision_curve
 from lcf3d.evaluation.kitti import DIFFICULTIES, KittiEvaluator, Selection
-from lcf3d.evaluation.kitti_matching import BELOW, FALSE_POSITIVE, NOT_JUDGED, TRUE_POSITIVE
+from lcf3d.evaluation.kitti_matching import BELOW, FALSE_POSITIVE, NOT_COUNTED, TRUE_POSITIVE
 from lcf3d.formats.kitti import KittiObjects
 from tests.evaluation.kitti_frames import dontcare, frames
 
@@ -161,29 +161,29 @@ def test_the_fate_of_each_detection() -> None:
     assert fate([{}], [{"box": far_right}]) == ([-1], [FALSE_POSITIVE])
     assert fate([{}], [{"score": 0.4}], threshold=0.5) == ([-1], [BELOW])
     # the neighbouring class is neither right nor wrong, a truck is wrong
-    assert fate([{"name": "Van"}], [{}]) == ([0], [NOT_JUDGED])
+    assert fate([{"name": "Van"}], [{}]) == ([0], [NOT_COUNTED])
     assert fate([{"name": "Truck"}], [{}]) == ([-1], [FALSE_POSITIVE])
     # the same for an object too hard for the difficulty
-    assert fate([{"occluded": 2}], [{}]) == ([0], [NOT_JUDGED])
+    assert fate([{"occluded": 2}], [{}]) == ([0], [NOT_COUNTED])
     # another class is not judged here
-    assert fate([{}], [{"name": "Cyclist"}]) == ([-1], [NOT_JUDGED])
+    assert fate([{}], [{"name": "Cyclist"}]) == ([-1], [NOT_COUNTED])
     # the second detection of one object is wrong
     assert fate([{}], [{"score": 0.5}, {"box": (0, 0, 100, 49)}]) == ([0], [TRUE_POSITIVE, FALSE_POSITIVE])
 
 
 def test_dontcare_counts_the_share_of_the_detection() -> None:
     # the region is far greater than the detection: IoU is small, the covered share is 1
-    assert fate([dontcare((0, 0, 1000, 1000))], [{}]) == ([-1], [NOT_JUDGED])
+    assert fate([dontcare((0, 0, 1000, 1000))], [{}]) == ([-1], [NOT_COUNTED])
     # 60 of 100 columns covered: not more than 0.7
     assert fate([dontcare((40, 0, 1000, 1000))], [{}]) == ([-1], [FALSE_POSITIVE])
 
 
 def test_a_detection_below_the_minimum_height_is_ignored_and_yields_to_a_proper_one() -> None:
     low, proper = {"box": (0, 0, 100, 39.5)}, {"box": (0, 0, 100, 45)}
-    assert fate([{"box": (0, 0, 100, 40)}], [low]) == ([0], [NOT_JUDGED])
-    assert fate([{"box": (0, 0, 100, 40)}], [low, proper]) == ([1], [NOT_JUDGED, TRUE_POSITIVE])
+    assert fate([{"box": (0, 0, 100, 40)}], [low]) == ([0], [NOT_COUNTED])
+    assert fate([{"box": (0, 0, 100, 40)}], [low, proper]) == ([1], [NOT_COUNTED, TRUE_POSITIVE])
     # even when it is of another class: a rule of the official program
-    assert fate([{"box": (0, 0, 100, 40)}], [{**low, "name": "Cyclist"}]) == ([0], [NOT_JUDGED])
+    assert fate([{"box": (0, 0, 100, 40)}], [{**low, "name": "Cyclist"}]) == ([0], [NOT_COUNTED])
 
 
 def test_an_object_exactly_at_the_limits_counts() -> None:

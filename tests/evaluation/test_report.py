@@ -3,12 +3,12 @@ from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
+from lcf3d.evaluation.kitti_fates import FusionFates, fusion_fates
+from lcf3d.evaluation.kitti_pictures import footprints, worst_frame_pictures
 from PIL import Image
 
 from lcf3d.evaluation.kitti import KittiEvaluator, Selection
 from lcf3d.evaluation.kitti_breakdown import compare
-from lcf3d.evaluation.kitti_fates import FusionFates, fusion_fates
-from lcf3d.evaluation.kitti_pictures import footprints, worst_frame_pictures
 from lcf3d.evaluation.kitti_study import ClassStudy, KittiStudy, study
 from lcf3d.evaluation.report import html_report
 from lcf3d.evaluation.svg import Line, Shape, bev_scene, image_scene, line_chart

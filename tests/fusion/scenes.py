@@ -8,6 +8,17 @@ from lcf3d.structures import KITTI_CLASSES, Camera, Detections2D, Detections3D, 
 
 CAR, PEDESTRIAN, CYCLIST = range(3)
 
+# the method's plain form, in which single steps are easiest to follow: hard filter, probabilistic ensemble
+PLAIN = {
+    "camera_score_threshold": 0.5,
+    "decisive_score": 0.0,
+    "lidar_score_threshold": 0.1,
+    "class_aware": False,
+    "assignment": "gated",
+    "unmatched": "drop",
+    "ensemble": "probabilistic",
+}
+
 
 def camera(name="left", yaw=0.0, width=1000, height=400, focal=500.0):
     """A camera at the origin, looking along LiDAR x turned by ``yaw``."""

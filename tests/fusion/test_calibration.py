@@ -84,9 +84,9 @@ def test_files_go_there_and_back(tmp_path):
     assert Calibration.load(tmp_path / "c.json") == calibration
     assert load_calibration(str(tmp_path / "c.json")) == calibration
     assert load_calibration("none") is None
-    assert calibration.judges("Car")
-    assert not calibration.judges("Cyclist")
-    assert Calibration().judges("Cyclist")
+    assert calibration.detects("Car")
+    assert not calibration.detects("Cyclist")
+    assert Calibration().detects("Cyclist")
 
 
 @pytest.mark.parametrize(

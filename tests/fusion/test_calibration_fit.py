@@ -93,7 +93,7 @@ def evidence_data(n, weights, seed=0):
 
 
 def test_evidence_finds_the_weights_that_made_the_data():
-    true = Evidence(base=-1, trust=0.7, support=(1.0, 2.0, 3.0, 5.0), miss=0.8, off_ground=1.5, rival=2.0)
+    true = Evidence(base=-1, trust=0.7, support=(1.0, 2.0, 3.0, 5.0), miss=0.8, off_ground=1.5, competing=2.0)
     found = fit_evidence(*evidence_data(60000, true.weights), strength=1.0, recovered=0.2)
     np.testing.assert_allclose(found.weights, true.weights, atol=0.35)
     assert found.recovered == 0.2

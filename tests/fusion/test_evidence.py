@@ -12,11 +12,13 @@ from lcf3d.fusion.evidence import (
     to_probability,
 )
 
-WEIGHTS = Evidence(base=-1, trust=0.5, support=(1.0, 2.0, 3.0, 5.0), miss=0.7, off_ground=2.0, rival=4.0, recovered=0.3)
+WEIGHTS = Evidence(
+    base=-1, trust=0.5, support=(1.0, 2.0, 3.0, 5.0), miss=0.7, off_ground=2.0, competing=4.0, recovered=0.3
+)
 
 
-def row(log_odds=0.0, rival=0.0, slope=0.0, exposure=0.0, score=0.0, iou=0.0):
-    return evidence_table(*(np.array([v], dtype=float) for v in (log_odds, rival, slope, exposure, score, iou)))
+def row(log_odds=0.0, competing=0.0, slope=0.0, exposure=0.0, score=0.0, iou=0.0):
+    return evidence_table(*(np.array([v], dtype=float) for v in (log_odds, competing, slope, exposure, score, iou)))
 
 
 def log_odds(**values):
@@ -35,7 +37,7 @@ def log_odds(**values):
         ({"exposure": 1.0}, -1 - 0.7),
         ({"exposure": 1.0, "score": 1.0, "iou": 0.5}, -1 + 1.0),  # matched: nothing was missed
         ({"slope": 0.5}, -1 - 1.0),
-        ({"rival": 0.5}, -1 - 2.0),
+        ({"competing": 0.5}, -1 - 2.0),
     ],
 )
 def test_log_odds_by_hand(values, expected):
@@ -54,10 +56,12 @@ def test_more_camera_support_never_lowers_a_score(value, exposure, score_a, scor
 
 
 @given(st.floats(-8, 8), st.floats(-8, 8), unit, unit, unit)
-def test_a_better_lidar_score_never_lowers_a_score(a, b, rival, score, iou):
+def test_a_better_lidar_score_never_lowers_a_score(a, b, competing, score, iou):
     low, high = sorted((a, b))
-    # a rival is one only while its score is the higher: it may vanish as the own score grows
-    assert log_odds(log_odds=low, rival=rival, score=score, iou=iou) <= log_odds(log_odds=high, score=score, iou=iou)
+    # a competing box is one only while its score is the higher: it may vanish as the own score grows
+    assert log_odds(log_odds=low, competing=competing, score=score, iou=iou) <= log_odds(
+        log_odds=high, score=score, iou=iou
+    )
 
 
 def test_weights_go_there_and_back():

@@ -4,12 +4,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lcf3d import FusionConfig, LateCascadeFusion, Lcf3dError
-from lcf3d.provenance import FusedDetections, Reason, Stage
+from lcf3d.provenance import FusedDetections, Outcome, Reason
 from lcf3d.structures import KITTI_CLASSES, Detections2D, Detections3D
 from tests.fusion.scenes import (
     CAR,
     CYCLIST,
     PEDESTRIAN,
+    PLAIN,
     TrueLocalizer,
     camera,
     car,
@@ -25,7 +26,7 @@ NEAR, FAR, WALKER = car(12, 2), car(25, -5), pedestrian(15, -4)
 
 def fuse(found3d, found2d, points=None, objects=(), views=None, **settings):
     views = views or [camera()]
-    fusion = LateCascadeFusion(FusionConfig().updated(**settings), TrueLocalizer(objects or [NEAR]))
+    fusion = LateCascadeFusion(FusionConfig(**PLAIN).updated(**settings), TrueLocalizer(objects or [NEAR]))
     return fusion(frame(views, points), found3d, found2d)
 
 
@@ -38,14 +39,14 @@ def test_matched_recovered_and_dropped():
     found2d = seen(camera(), [NEAR, WALKER], [0.9, 0.8], [CAR, PEDESTRIAN])
     fused = fuse(lidar([NEAR, FAR], [0.7, 0.6]), {"left": found2d}, points, [NEAR, WALKER])
     names = [KITTI_CLASSES[i] for i in fused.detections.labels]
-    assert sorted(zip(names, fused.stages.tolist(), strict=True)) == [
-        ("Car", Stage.MATCHED),
-        ("Pedestrian", Stage.RECOVERED),
+    assert sorted(zip(names, fused.outcomes.tolist(), strict=True)) == [
+        ("Car", Outcome.MATCHED),
+        ("Pedestrian", Outcome.RECOVERED),
     ]
     walker = names.index("Pedestrian")
     np.testing.assert_allclose(fused.detections.boxes[walker], WALKER, atol=1e-6)
     assert fused.detections.scores[walker] == pytest.approx(0.8)  # s2d * IoU, and the IoU is 1
-    assert fused.lidar.row(1)["stage"] == "dropped"
+    assert fused.lidar.row(1)["outcome"] == "dropped"
     assert fused.lidar.row(1)["reason"] == "unconfirmed"
     assert "image IoU 1.00" in fused.explain(1 - walker)
     assert fused.explain_lidar(1).startswith("Car 0.60, dropped: it is in view of a camera and no camera detection")
@@ -71,7 +72,7 @@ def test_a_camera_that_is_not_sure_changes_no_label(relabel_score, label, score)
     fused = fuse(lidar([NEAR], [0.8], [CYCLIST]), {"left": found2d}, relabel_score=relabel_score)
     assert fused.detections.labels.tolist() == [label]
     assert fused.detections.scores.tolist() == [score]
-    assert fused.stages.tolist() == [Stage.MATCHED]
+    assert fused.outcomes.tolist() == [Outcome.MATCHED]
 
 
 @pytest.mark.parametrize(("policy", "score"), [("drop", None), ("keep", 0.6), ("downweight", 0.6 * 0.2 / 0.44)])
@@ -112,13 +113,13 @@ def test_cluster_members_are_merged_and_say_so():
 def test_representative_of_the_cameras_class():
     found = lidar([NEAR, car(12.1, 2)], [0.9, 0.5], [CYCLIST, CAR])
     views = {"left": seen(camera(), [NEAR], [0.9], [CAR])}
-    assert fuse(found, views).lidar.row(0)["stage"] == "matched"
+    assert fuse(found, views).lidar.row(0)["outcome"] == "matched"
     by_class = fuse(found, views, representative="camera_class")
-    assert by_class.lidar.row(1)["stage"] == "matched"
+    assert by_class.lidar.row(1)["outcome"] == "matched"
     assert by_class.detections.labels.tolist() == [CAR]
     # a class that no member has leaves the highest score
     other = {"left": seen(camera(), [NEAR], [0.9], [PEDESTRIAN])}
-    assert fuse(found, other, representative="camera_class").lidar.row(0)["stage"] == "matched"
+    assert fuse(found, other, representative="camera_class").lidar.row(0)["outcome"] == "matched"
 
 
 def test_recovery_reasons():
@@ -136,7 +137,9 @@ def test_recovery_reasons():
 def test_recovered_box_must_project_onto_its_detection():
     # the localizer answers with a car ten metres further: its projection is too small
     points = surface_points([NEAR])
-    wrong = LateCascadeFusion(FusionConfig(), lambda p: (p.frustum_from_lidar(np.array([car(40, 6.7)])), np.ones(1)))
+    wrong = LateCascadeFusion(
+        FusionConfig(**PLAIN), lambda p: (p.frustum_from_lidar(np.array([car(40, 6.7)])), np.ones(1))
+    )
     fused = wrong(frame([camera()], points), lidar([], []), {"left": seen(camera(), [NEAR], [0.9])})
     assert len(fused) == 0
     assert fused.camera.row(0)["reason"] == "disagrees"
@@ -146,7 +149,7 @@ def test_recovered_box_must_project_onto_its_detection():
 @pytest.mark.parametrize(("quality", "reason"), [(0.29, "poor_fit"), (0.3, "localized")])
 def test_quality_of_the_fit_is_asked_for(quality, reason):
     doubtful = LateCascadeFusion(
-        FusionConfig(), lambda p: (p.frustum_from_lidar(np.array([NEAR])), np.full(len(p), quality))
+        FusionConfig(**PLAIN), lambda p: (p.frustum_from_lidar(np.array([NEAR])), np.full(len(p), quality))
     )
     fused = doubtful(frame([camera()], surface_points([NEAR])), lidar([], []), {"left": seen(camera(), [NEAR], [0.9])})
     assert fused.camera.row(0)["reason"] == reason
@@ -154,13 +157,13 @@ def test_quality_of_the_fit_is_asked_for(quality, reason):
 
 
 def test_localizer_without_an_answer():
-    mute = LateCascadeFusion(FusionConfig(), lambda p: (np.full((len(p), 7), np.nan), np.zeros(len(p))))
+    mute = LateCascadeFusion(FusionConfig(**PLAIN), lambda p: (np.full((len(p), 7), np.nan), np.zeros(len(p))))
     fused = mute(frame([camera()], surface_points([NEAR])), lidar([], []), {"left": seen(camera(), [NEAR], [0.9])})
     assert fused.camera.row(0)["reason"] == "not_localized"
 
 
 def test_localizer_of_the_wrong_shape_is_named():
-    wrong = LateCascadeFusion(FusionConfig(), lambda p: (np.zeros((len(p), 6)), np.zeros(len(p))))
+    wrong = LateCascadeFusion(FusionConfig(**PLAIN), lambda p: (np.zeros((len(p), 6)), np.zeros(len(p))))
     with pytest.raises(Lcf3dError, match=r"boxes of shape \(1, 7\) and as many qualities, got \(1, 6\)"):
         wrong(frame([camera()], surface_points([NEAR])), lidar([], []), {"left": seen(camera(), [NEAR], [0.9])})
 
@@ -186,7 +189,7 @@ def test_recovered_box_replaces_an_unconfirmed_one():
         unmatched="downweight",
     )
     assert fused.lidar.row(0)["reason"] == "replaced"
-    assert fused.stages.tolist() == [Stage.RECOVERED]
+    assert fused.outcomes.tolist() == [Outcome.RECOVERED]
 
 
 def two_cameras():
@@ -300,8 +303,8 @@ def test_every_input_and_output_is_accounted_for(seed, unmatched, assignment):
     led = np.concatenate([fused.lidar.output, fused.camera.output])
     assert set(led[led >= 0]) == set(range(len(fused)))
     for table in (fused.lidar, fused.camera):
-        assert ((table.stage == Stage.DROPPED) == (table.output < 0)).all()
-    matched = fused.lidar.stage == Stage.MATCHED
+        assert ((table.outcome == Outcome.DROPPED) == (table.output < 0)).all()
+    matched = fused.lidar.outcome == Outcome.MATCHED
     outputs = fused.lidar.output[matched]
     np.testing.assert_array_equal(fused.detections.boxes[outputs], found3d.boxes[matched])
     np.testing.assert_array_equal(fused.detections.scores[outputs], fused.lidar.score[matched])

@@ -95,5 +95,5 @@ def test_a_blind_camera_loses_its_weight():
         for i, (f, found, two_d) in enumerate(drive(600))
     ]
     cars = self_calibrate(blind, CONFIG).evidence["Car"]
-    assert cars.support[-1] < 0.8 * CONFIG.evidence["Car"].support[-1]
-    assert cars.trust == CONFIG.evidence["Car"].trust
+    assert cars.support[-1] < 0.8 * CONFIG.evidence_of("Car").support[-1]
+    assert cars.trust == CONFIG.evidence_of("Car").trust

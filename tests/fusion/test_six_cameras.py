@@ -9,9 +9,9 @@ from lcf3d import FusionConfig, LateCascadeFusion
 from lcf3d.datasets.nuscenes import NuscenesDataset
 from lcf3d.geometry.camera import project_boxes
 from lcf3d.geometry.iou import image_area
-from lcf3d.provenance import Reason, Stage
+from lcf3d.provenance import Outcome, Reason
 from lcf3d.structures import KITTI_CLASSES, Camera, Detections2D, Frame
-from tests.fusion.scenes import CAR, TrueLocalizer, camera, car, lidar, surface_points
+from tests.fusion.scenes import CAR, PLAIN, TrueLocalizer, camera, car, lidar, surface_points
 
 DEMO = "ca9a282c9e77460f8360f564131a8af5"
 # 2D detections below this area in px are nothing a detector would report
@@ -47,7 +47,7 @@ def detected(views, boxes, noise_px=0.0, seed=0):
 
 
 def fuse(views, found3d, found2d, objects, points=None, **settings):
-    fusion = LateCascadeFusion(FusionConfig().updated(**settings), TrueLocalizer(objects))
+    fusion = LateCascadeFusion(FusionConfig(**PLAIN).updated(**settings), TrueLocalizer(objects))
     return fusion(Frame("ring", points, views), found3d, found2d)
 
 
@@ -62,13 +62,13 @@ def check_once(views, azimuths, noise_px):
         shared += seeing > 1
         points = surface_points([box])
         matched = fuse(views, lidar([box], [0.7]), found, [box], points)
-        assert matched.stages.tolist() == [Stage.MATCHED], azimuth
+        assert matched.outcomes.tolist() == [Outcome.MATCHED], azimuth
         # the other camera's view of it is accounted for, and led to nothing of its own
         others = [matched.camera.row(i)["reason"] for i in range(len(matched.camera))]
         assert others.count("confirmed") == 1
         assert set(others) <= {"confirmed", "other_view", "seen_elsewhere", "duplicate", "disagrees"}, azimuth
         recovered = fuse(views, lidar([], []), found, [box], points)
-        assert recovered.stages.tolist() == [Stage.RECOVERED], azimuth
+        assert recovered.outcomes.tolist() == [Outcome.RECOVERED], azimuth
         np.testing.assert_allclose(recovered.detections.boxes[0, :2], box[:2], atol=1e-6)
     return shared
 
@@ -96,8 +96,8 @@ def test_two_objects_side_by_side_at_a_border_stay_two():
     views = ring()
     boxes = [around(27.0, 15.0, 0.0), around(38.0, 15.0, 0.0)]
     fused = fuse(views, lidar(boxes[:1], [0.7]), detected(views, boxes), boxes, surface_points(boxes))
-    assert sorted(fused.stages.tolist()) == [Stage.MATCHED, Stage.RECOVERED]
-    found = fused.detections.boxes[np.argsort(fused.stages)]
+    assert sorted(fused.outcomes.tolist()) == [Outcome.MATCHED, Outcome.RECOVERED]
+    found = fused.detections.boxes[np.argsort(fused.outcomes)]
     np.testing.assert_allclose(found[:, :2], np.array(boxes)[:, :2], atol=1e-6)
 
 
@@ -108,7 +108,7 @@ def test_what_only_a_missing_camera_would_have_judged_is_out_of_view():
     del found2d["cam2"]
     fused = fuse(views, lidar([inside, at_border, ahead], [0.6, 0.5, 0.4]), found2d, [ahead], unmatched="drop")
     assert [fused.lidar.row(i)["reason"] for i in range(3)] == ["out_of_view", "unconfirmed", "confirmed"]
-    assert [fused.lidar.row(i)["stage"] for i in range(3)] == ["kept", "dropped", "matched"]
+    assert [fused.lidar.row(i)["outcome"] for i in range(3)] == ["kept", "dropped", "matched"]
     assert fused.camera_names == ("cam0", "cam1", "cam3", "cam4", "cam5")
     assert any("camera cam2" in note for note in fused.notes)
     # with all six cameras somebody has looked there and seen nothing
@@ -123,7 +123,7 @@ def test_an_object_at_a_border_is_confirmed_by_the_camera_that_is_left():
     found = detected(views, [box])
     del found["cam1"]
     fused = fuse(views, lidar([box], [0.7]), found, [box])
-    assert fused.stages.tolist() == [Stage.MATCHED]
+    assert fused.outcomes.tolist() == [Outcome.MATCHED]
     assert fused.camera_names[fused.lidar.camera[0]] == "cam0"
 
 

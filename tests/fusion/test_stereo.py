@@ -9,12 +9,13 @@ from lcf3d import Lcf3dError
 from lcf3d.fusion.frustum import extract_frustums
 from lcf3d.fusion.stereo import StereoConfig, StereoLateCascadeFusion
 from lcf3d.geometry.camera import project_points
-from lcf3d.provenance import FusedDetections, Reason, Stage
+from lcf3d.provenance import FusedDetections, Outcome, Reason
 from lcf3d.structures import KITTI_CLASSES, Detections2D, InstanceMask
 from tests.fusion.scenes import (
     CAR,
     CYCLIST,
     PEDESTRIAN,
+    PLAIN,
     TrueLocalizer,
     camera,
     car,
@@ -32,7 +33,7 @@ NEAR, WALKER = car(12, 2), pedestrian(15, -4)
 def fuse(found3d, found2d, points=None, objects=(), views=None, localizer=None, **settings):
     settings = {"unmatched": "drop", "ensemble": "probabilistic", "unpaired": "discard", **settings}
     fusion = StereoLateCascadeFusion(
-        StereoConfig().updated(**settings), localizer or TrueLocalizer(list(objects) or [NEAR])
+        StereoConfig(**PLAIN).updated(**settings), localizer or TrueLocalizer(list(objects) or [NEAR])
     )
     return fusion(frame(views or rig(), points), found3d, found2d)
 
@@ -47,27 +48,29 @@ def both(objects, scores=(0.9, 0.8), labels=None, views=None):
     return {v.name: seen(v, objects, [s] * len(objects), labels) for v, s in zip(views, scores, strict=True)}
 
 
-# LiDAR, left, right -> stage of the output (None for no output), reason of the LiDAR box, of the left and right one
+# LiDAR, left, right -> outcome of the output (None for no output), reason of the LiDAR box, of the left and right one
 SUMMARY_TABLE = [
     (False, False, False, None, None, None, None),
     (False, False, True, None, None, None, "unpaired"),
     (False, True, False, None, None, "unpaired", None),
-    (False, True, True, Stage.RECOVERED, None, "localized", "localized"),
+    (False, True, True, Outcome.RECOVERED, None, "localized", "localized"),
     (True, False, False, None, "unconfirmed", None, None),
-    (True, False, True, Stage.MATCHED, "confirmed", None, "confirmed"),
-    (True, True, False, Stage.MATCHED, "confirmed", "confirmed", None),
-    (True, True, True, Stage.MATCHED, "confirmed", "confirmed", "second_view"),
+    (True, False, True, Outcome.MATCHED, "confirmed", None, "confirmed"),
+    (True, True, False, Outcome.MATCHED, "confirmed", "confirmed", None),
+    (True, True, True, Outcome.MATCHED, "confirmed", "confirmed", "second_view"),
 ]
 
 
-@pytest.mark.parametrize(("in_lidar", "in_left", "in_right", "stage", "of_lidar", "of_left", "of_right"), SUMMARY_TABLE)
-def test_matching_summary_table(in_lidar, in_left, in_right, stage, of_lidar, of_left, of_right):
+@pytest.mark.parametrize(
+    ("in_lidar", "in_left", "in_right", "outcome", "of_lidar", "of_left", "of_right"), SUMMARY_TABLE
+)
+def test_matching_summary_table(in_lidar, in_left, in_right, outcome, of_lidar, of_left, of_right):
     found = {
         name: d if there else none2d()
         for (name, d), there in zip(both([NEAR]).items(), (in_left, in_right), strict=True)
     }
     fused = fuse(lidar([NEAR], [0.8]) if in_lidar else lidar([], []), found, surface_points([NEAR]))
-    assert fused.stages.tolist() == ([] if stage is None else [stage])
+    assert fused.outcomes.tolist() == ([] if outcome is None else [outcome])
     assert [fused.lidar.row(i)["reason"] for i in range(len(fused.lidar))] == [r for r in [of_lidar] if r]
     assert [fused.camera.row(i)["reason"] for i in range(len(fused.camera))] == [r for r in [of_left, of_right] if r]
 
@@ -116,7 +119,7 @@ def test_recovered_score_is_multiplied_by_both_overlaps():
     found = {"left": widened(found["left"], 2), "right": widened(found["right"], 1.25)}
     fused = fuse(lidar([], []), found, surface_points([NEAR]))
     assert fused.detections.scores[0] == pytest.approx(0.9 * 0.5 * 0.8)
-    assert fused.stages.tolist() == [Stage.RECOVERED]
+    assert fused.outcomes.tolist() == [Outcome.RECOVERED]
     assert [fused.camera.row(i)["iou"] for i in range(2)] == pytest.approx([0.5, 0.8])
     assert [fused.camera.row(i)["pair"] for i in range(2)] == [1, 0]
     assert [fused.camera.row(i)["output"] for i in range(2)] == [0, 0]
@@ -172,7 +175,7 @@ def test_masks_of_both_views():
 def test_single_view_recovers_what_only_one_view_has():
     found = {"left": both([NEAR])["left"], "right": none2d()}
     fused = fuse(lidar([], []), found, surface_points([NEAR]), unpaired="single_view")
-    assert fused.stages.tolist() == [Stage.RECOVERED]
+    assert fused.outcomes.tolist() == [Outcome.RECOVERED]
     assert fused.detections.scores[0] == pytest.approx(0.9)
     assert fused.camera.row(0)["pair"] is None
 
@@ -243,7 +246,7 @@ def test_without_a_scan():
 
 def test_one_view_missing_is_a_single_camera():
     fused = fuse(lidar([], []), {"left": both([NEAR])["left"]}, surface_points([NEAR]))
-    assert fused.stages.tolist() == [Stage.RECOVERED]
+    assert fused.outcomes.tolist() == [Outcome.RECOVERED]
     assert any("left was used as a single camera" in note for note in fused.notes)
     assert any("right has no detections" in note for note in fused.notes)
 
@@ -269,7 +272,7 @@ def test_two_pairs_and_a_single_camera():
     )
     # front pair and side camera are recovered; behind, 0.7 * 0.5 * 0.6 against 0.3 * 0.5 * 0.4
     assert fused.detections.scores == pytest.approx([0.9, 0.7 * 0.6 / (0.7 * 0.6 + 0.3 * 0.4), 0.7])
-    assert fused.stages.tolist() == [Stage.RECOVERED, Stage.MATCHED, Stage.RECOVERED]
+    assert fused.outcomes.tolist() == [Outcome.RECOVERED, Outcome.MATCHED, Outcome.RECOVERED]
 
 
 def test_more_confident_view_becomes_primary_within_its_own_pair_only():
@@ -374,14 +377,14 @@ def test_every_input_and_output_is_accounted_for(seed, unpaired, assignment):
     led = np.concatenate([fused.lidar.output, fused.camera.output])
     assert set(led[led >= 0]) == set(range(len(fused)))
     table = fused.camera
-    assert ((table.stage == Stage.DROPPED) == (table.output < 0)).all()
+    assert ((table.outcome == Outcome.DROPPED) == (table.output < 0)).all()
     paired = np.flatnonzero(table.pair >= 0)
     other = table.pair[paired]
     np.testing.assert_array_equal(table.pair[other], paired)
     np.testing.assert_array_equal(table.output[other], table.output[paired])
     assert (table.camera[other] != table.camera[paired]).all()
     assert not np.isin(table.reason[paired], [Reason.UNPAIRED, Reason.OTHER_VIEW]).any()
-    recovered = paired[table.stage[paired] == Stage.RECOVERED]
+    recovered = paired[table.outcome[paired] == Outcome.RECOVERED]
     expected = np.fmax(table.camera_score[recovered], table.camera_score[table.pair[recovered]])
     overlaps = table.iou[recovered] * table.iou[table.pair[recovered]]
     np.testing.assert_allclose(fused.detections.scores[table.output[recovered]], expected * overlaps)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lcf3d.provenance import Decisions, FusedDetections, Reason, Stage
+from lcf3d.provenance import Decisions, FusedDetections, Outcome, Reason
 from lcf3d.structures import Camera, Detections2D, Detections3D
 
 # camera x right, y down, z forward, at the LiDAR's origin
@@ -39,11 +39,11 @@ def fused() -> FusedDetections:
     )
     lidar_table, camera_table = Decisions.blank(4), Decisions.blank(4)
     lidar_table.lidar[:] = range(4)
-    lidar_table.stage[:2] = Stage.MATCHED, Stage.KEPT
+    lidar_table.outcome[:2] = Outcome.MATCHED, Outcome.KEPT
     lidar_table.reason[:3] = Reason.CONFIRMED, Reason.DOWNWEIGHTED, Reason.UNCONFIRMED
     lidar_table.output[:2] = 0, 1
     camera_table.camera[:], camera_table.detection[:] = 0, range(4)
-    camera_table.stage[:2] = Stage.MATCHED, Stage.RECOVERED
+    camera_table.outcome[:2] = Outcome.MATCHED, Outcome.RECOVERED
     camera_table.reason[:3] = Reason.CONFIRMED, Reason.LOCALIZED, Reason.FEW_POINTS
     camera_table.output[:2] = 0, 2
     return FusedDetections(outputs, lidar_table, camera_table, lidar, (camera,), ("left",))

@@ -76,11 +76,11 @@ def test_scaled_camera_scales_pixels(camera: Camera) -> None:
 def test_scene_of_a_fusion(fused: FusedDetections) -> None:
     scene = Scene.from_fused(fused)
     # LiDAR detection 3 was below the threshold: it never took part
-    assert scene.stages == ("matched", "downweighted", "recovered", "dropped")
+    assert scene.outcomes == ("matched", "downweighted", "recovered", "dropped")
     assert scene.counts == {"matched": 1, "recovered": 1, "downweighted": 1, "dropped": 1}
     assert scene.texts == ("Car 0.95", "Car 0.40", "Pedestrian 0.30", "")
     np.testing.assert_array_equal(scene.boxes[3], fused.lidar_inputs.boxes[2])
-    assert [scene.stages[i] for i in scene.drawing_order] == ["dropped", "downweighted", "recovered", "matched"]
+    assert [scene.outcomes[i] for i in scene.drawing_order] == ["dropped", "downweighted", "recovered", "matched"]
     left = scene.image_boxes["left"]
     assert left.used.tolist() == [True, True, False]
     assert left.texts == ("", "", "Pedestrian 0.50 few points")
@@ -91,28 +91,28 @@ def test_scene_without_low_scores(fused: FusedDetections) -> None:
     scene = Scene.from_fused(fused, least_score=limit)
     kept = fused.detections.boxes[fused.detections.scores >= limit]
     np.testing.assert_array_equal(scene.boxes[: len(kept)], kept)
-    assert all(scene.stages[i] != "dropped" for i in range(len(kept)))
+    assert all(scene.outcomes[i] != "dropped" for i in range(len(kept)))
 
 
 def test_scene_of_detections() -> None:
     found = Detections3D(BOX, np.array([0.5]), np.array([0]), ("Car",))
     flat = Detections2D(np.array([[0, 0, 9, 9.0]]), np.array([0.25]), np.array([0]), ("Car",))
     scene = Scene.from_detections(found, {"left": flat}, truth=found)
-    assert (scene.stages, scene.texts) == (("detection",), ("Car 0.50",))
+    assert (scene.outcomes, scene.texts) == (("detection",), ("Car 0.50",))
     assert scene.image_boxes["left"].texts == ("Car 0.25",)
     np.testing.assert_array_equal(scene.truth, BOX)
 
 
-@pytest.mark.parametrize("stage", ["matched", "recovered", "kept", "downweighted"])
-def test_boxes_have_the_colour_of_their_stage(camera: Camera, stage: str) -> None:
+@pytest.mark.parametrize("outcome", ["matched", "recovered", "kept", "downweighted"])
+def test_boxes_have_the_colour_of_their_outcome(camera: Camera, outcome: str) -> None:
     image = np.zeros((100, 200, 3), dtype=np.uint8)
-    picture = draw_camera(image, camera, Scene(BOX, (stage,), ("",)))
+    picture = draw_camera(image, camera, Scene(BOX, (outcome,), ("",)))
     assert picture.size == (200, 100)
     for other in COLOURS:
-        expected = other == stage or COLOURS[other] == COLOURS[stage]
+        expected = other == outcome or COLOURS[other] == COLOURS[outcome]
         assert has_colour(picture, COLOURS[other]) == expected
-    above = draw_bev(None, [camera], Scene(BOX, (stage,), ("",)), BevView.fit(BOX, [camera], 300, 200))
-    assert has_colour(above, COLOURS[stage])
+    above = draw_bev(None, [camera], Scene(BOX, (outcome,), ("",)), BevView.fit(BOX, [camera], 300, 200))
+    assert has_colour(above, COLOURS[outcome])
 
 
 def test_dropped_boxes_are_dim_and_behind(camera: Camera) -> None:
@@ -164,8 +164,8 @@ def test_one_camera_above_the_ground_plan(camera: Camera, fused: FusedDetections
     frame = Frame("000001", np.zeros((5, 4), np.float32), [camera], {"left": np.zeros((100, 200, 3), np.uint8)})
     picture = draw_frame(frame, Scene.from_fused(fused))
     assert picture.width == 200
-    for stage in ("matched", "recovered", "downweighted"):
-        assert has_colour(picture, COLOURS[stage])
+    for outcome in ("matched", "recovered", "downweighted"):
+        assert has_colour(picture, COLOURS[outcome])
     only_image = draw_frame(frame, Scene.from_fused(fused), bev=False)
     assert picture.height > only_image.height > 100
     save_png(picture, tmp_path / "deep" / "a.png")

@@ -7,34 +7,33 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from lcf3d.errors import ConfigError, DatasetError
+from lcf3d.errors import DatasetError
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
     from lcf3d.evaluation.ablation import AblationInput, AblationRow
-    from lcf3d.formats.kitti import KittiFrames
-    from lcf3d.fusion.calibration import Calibration
-    from lcf3d.fusion.config import FusionConfig
-    from lcf3d.run.setup import RunRequest
+    from lcf3d.evaluation.protocol import Evaluation, TableData
+    from lcf3d.run.setup import Inputs
 
 
 def ablate(
-    dataset: Annotated[str, typer.Argument(help="kitti:ROOT, with labels")],
+    dataset: Annotated[str, typer.Argument(help="kitti:ROOT, nuscenes:ROOT or another installed kind, with labels")],
     lidar: Annotated[str, typer.Option(help="LiDAR detector, kind:argument, for example results:DIR")],
     camera: Annotated[str, typer.Option(help="camera detector, kind:argument, for example results:DIR or onnx:FILE")],
-    split: Annotated[str, typer.Option(help="file of ROOT/ImageSets")] = "val",
+    split: Annotated[str | None, typer.Option(help="split of the dataset; all frames if left out")] = None,
+    tables: Annotated[str | None, typer.Option(help="nuScenes: folder of tables; the only one if left out")] = None,
     calibration: Annotated[
         str, typer.Option(help="score calibration: a file of 'lcf3d calibrate', auto, or none")
     ] = "auto",
-    config: Annotated[str, typer.Option(help="preset or YAML file that the variants change")] = "kitti",
+    config: Annotated[
+        str | None, typer.Option(help="preset or YAML file that the variants change; the dataset's if left out")
+    ] = None,
     set_: Annotated[list[str] | None, typer.Option("--set", help="change a setting, name=value; repeatable")] = None,
     localizer: Annotated[str, typer.Option(help="for recovery, as for lcf3d run")] = "geometric",
     tiles: Annotated[int, typer.Option(min=1, help="overlapping tiles across wide images, for onnx: detectors")] = 1,
-    missing: Annotated[str, typer.Option(help="result files that are not there: error, or empty")] = "error",
+    missing: Annotated[str, typer.Option(help="results that are not there: error, or empty")] = "error",
     json_: Annotated[bool, typer.Option("--json", help="print the rows as JSON")] = False,
 ) -> None:
-    """Measure the fusion with parts of it switched off or exchanged (3D AP R40).
+    """Measure the fusion with parts of it switched off or exchanged.
 
     Rows with detection recovery need LiDAR scans for all frames, mask modes a camera detector with masks.
 
@@ -42,81 +41,84 @@ def ablate(
 
     lcf3d ablate kitti:KITTI --split val --lidar results:point_gnn --camera results:rcnn
 
-    lcf3d ablate kitti:KITTI --split val --lidar results:point_gnn --camera onnx:segmentation.onnx --tiles 2
+    lcf3d ablate nuscenes:NUSCENES --lidar results:centerpoint.json --camera results:detections_2d.json
     """
     import json
 
-    from lcf3d.cli.calibrate import plain, tracked, wide_console
+    from lcf3d.cli.console import plain, print_table, tracked
     from lcf3d.evaluation.ablation import ablate as measure
-    from lcf3d.localizers.named import load_localizer
-    from lcf3d.run.setup import RunRequest
+    from lcf3d.evaluation.protocol import open_evaluation
+    from lcf3d.fusion.calibration import load_calibration
+    from lcf3d.fusion.self_calibration import self_calibrate
+    from lcf3d.run.setup import RunRequest, read_inputs
+    from lcf3d.run.sources import LidarOnScans
 
     request = RunRequest(
-        dataset, lidar, {"left": camera}, split, config=config, changes=tuple(set_ or ()), tiles=tiles, missing=missing
+        dataset,
+        lidar,
+        {"*": camera},
+        split,
+        tables,
+        config=config,
+        changes=tuple(set_ or ()),
+        localizer=localizer,
+        tiles=tiles,
+        missing=missing,
     )
-    inputs, truth, settings, suppress = _read(request)
-    scores = _calibration(calibration, inputs, settings)
-    chosen, progress = load_localizer(localizer), plain if json_ else tracked
-    rows = measure(inputs, truth, settings, scores, chosen, progress, suppress)
+    found = read_inputs(request)
+    evaluation = open_evaluation(found.dataset, found.frame_ids)
+    inputs = detections_of(found)
+    scores = self_calibrate(inputs, found.config) if calibration == "auto" else load_calibration(calibration)
+    progress, suppress = plain if json_ else tracked, isinstance(found.lidar, LidarOnScans)
+    rows = measure(inputs, evaluation, found.config, scores, found.localizer, progress, suppress)
     scans = all(item.frame.points is not None for item in inputs)
     if json_:
         typer.echo(json.dumps({"frames": len(inputs), "scans": scans, "rows": [r.to_json() for r in rows]}, indent=2))
         return
-    console = wide_console()
-    console.print(_table(rows, len(inputs)))
-    if not scans:
-        console.print("not every frame has a LiDAR scan: rows with detection recovery are left out", soft_wrap=True)
+    print_table(ablation_table(rows, evaluation, len(inputs), scans))
 
 
-def _read(request: RunRequest) -> tuple[list[AblationInput], KittiFrames, FusionConfig, bool]:
-    """Frames with their detections, the labels, the settings, and whether a LiDAR network ran here without NMS."""
-    from lcf3d.datasets.kitti import KittiDataset
+def detections_of(found: Inputs) -> list[AblationInput]:
+    """Frames with the detections of both branches, read or made now.
+
+    Raises:
+        DatasetError: a frame has no image for the camera branch.
+    """
     from lcf3d.evaluation.ablation import AblationInput
-    from lcf3d.formats.kitti import read_folder
-    from lcf3d.run.setup import read_inputs
-    from lcf3d.run.sources import LidarOnScans
 
-    found = read_inputs(request)
-    if not isinstance(found.dataset, KittiDataset):
-        raise ConfigError(f"ablate reads kitti:ROOT, got {request.dataset!r}")
-    truth = read_folder(found.dataset.folder / "label_2", found.frame_ids, results=False)
     inputs = []
     for frame in map(found.dataset.frame, found.frame_ids):
-        camera = found.cameras["left"]
-        if not camera.sees(frame, "left"):
-            raise DatasetError(f"frame {frame.id} has no left image; pass results:DIR as the camera branch")
-        inputs.append(AblationInput(frame, found.lidar.detect(frame), camera.detect(frame, "left")))
-    return inputs, truth, found.config, isinstance(found.lidar, LidarOnScans)
+        there = [camera.name for camera in frame.cameras if camera.name in found.cameras]
+        seen = {n: found.cameras[n].detect(frame, n) for n in there if found.cameras[n].sees(frame, n)}
+        if there and not seen:
+            raise DatasetError(f"frame {frame.id} has no image of {' or '.join(there)}; pass results:PATH as --camera")
+        inputs.append(AblationInput(frame, found.lidar.detect(frame), seen))
+    return inputs
 
 
-def _calibration(text: str, inputs: Sequence[AblationInput], settings: FusionConfig) -> Calibration | None:
-    from lcf3d.fusion.calibration import load_calibration
-    from lcf3d.fusion.self_calibration import self_calibrate
+def ablation_table(rows: Sequence[AblationRow], evaluation: Evaluation, frames: int, scans: bool) -> TableData:
+    """The rows under their headings; classes without any figure are left out, and their mean is added for many."""
+    from lcf3d.evaluation.protocol import TableData
 
-    if text == "auto":
-        return self_calibrate(inputs, settings)
-    if not text:
-        raise ConfigError("--calibration takes a file, auto or none")
-    return load_calibration(text)
-
-
-def _table(rows: Sequence[AblationRow], frames: int) -> Table:
-    """The rows under their headings; classes without any figure are left out."""
-    from rich.table import Table
-
-    names = [name for name in rows[0].ap if any(ap[0] == ap[0] for ap in (row.ap[name] for row in rows))]
-    table = Table(title=f"3D AP R40, easy moderate hard, on {frames} frames")
-    table.add_column("variant", no_wrap=True)
-    for name in names:
-        table.add_column(name, justify="right", no_wrap=True)
-    for stage in ("matched", "recovered", "kept"):
-        table.add_column(stage, justify="right", no_wrap=True)
+    names = [name for name in rows[0].ap if any(row.ap[name][0] == row.ap[name][0] for row in rows)]
+    wide = len(names) > 4
+    cells: list[tuple[str, ...] | None] = []
     group = ""
     for row in rows:
         if row.group != group:
             group = row.group
-            table.add_section()
-            table.add_row(f"[bold]{group}[/bold]")
-        cells = (" ".join(f"{value:.2f}" for value in row.ap[name]) for name in names)
-        table.add_row(row.name, *cells, str(row.matched), str(row.recovered), str(row.kept))
-    return table
+            cells.append((f"{group}:", *("" for _ in range(len(names) + wide + 3))))
+        values = [" ".join(f"{value:.1f}" if wide else f"{value:.2f}" for value in row.ap[name]) for name in names]
+        if wide:
+            known = [row.ap[name][0] for name in names if row.ap[name][0] == row.ap[name][0]]
+            values = [f"{sum(known) / max(len(known), 1):.2f}", *values]
+        cells.append((f"  {row.name}", *values, str(row.matched), str(row.recovered), str(row.kept)))
+    columns = ("mean", *(_short(name) for name in names)) if wide else tuple(names)
+    notes = () if scans else ("not every frame has a LiDAR scan: rows with detection recovery are left out",)
+    title = f"{evaluation.heading}, {' '.join(evaluation.columns)}, on {frames} frames"
+    return TableData(title, ("variant", *columns, "matched", "recovered", "kept"), cells, notes)
+
+
+def _short(name: str) -> str:
+    """A class name for a narrow column."""
+    return name if len(name) <= 6 else "\n".join(part[:7] for part in name.replace("_", " ").split())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from importlib import import_module
+from typing import Annotated
 
 import typer
 
@@ -31,9 +32,30 @@ app = typer.Typer(
     name="lcf3d",
     help="Late-cascade fusion of camera and LiDAR detections for 3D object detection.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
 )
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        from lcf3d import __version__
+
+        typer.echo(f"lcf3d {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def options(
+    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="say what is being done")] = False,
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="print the version and stop")
+    ] = False,
+) -> None:
+    """Late-cascade fusion of camera and LiDAR detections for 3D object detection."""
+    from lcf3d.cli.console import start_logging
+
+    start_logging(verbose)
+
 
 for verb, module in VERBS.items():
     app.command(verb)(getattr(import_module(f"lcf3d.cli.{module}"), verb))

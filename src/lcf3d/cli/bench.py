@@ -60,15 +60,13 @@ def _fusion(seconds: float) -> list[dict[str, Any]]:
 
 def _evaluation(dataset: str | None, results: Path | None, seconds: float) -> list[dict[str, Any]]:
     from lcf3d.benchmark.evaluation import bench_evaluation
-    from lcf3d.datasets.opening import parse_dataset
+    from lcf3d.datasets.opening import root_of
 
     if (dataset is None) != (results is None):
         raise ConfigError("bench eval takes --dataset and --results together")
     root = None
     if dataset is not None:
-        kind, root = parse_dataset(dataset)
-        if kind != "kitti":
-            raise ConfigError(f"bench eval times kitti:ROOT, got {dataset!r}")
+        _, root = root_of(dataset, ("kitti",), "bench eval")
     return [_row(timing) for timing in bench_evaluation(seconds, root, results)]
 
 

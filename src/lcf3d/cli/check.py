@@ -12,10 +12,10 @@ if TYPE_CHECKING:
 
 
 def check(
-    dataset: Annotated[str, typer.Argument(help="kitti:ROOT or nuscenes:ROOT")],
-    split: Annotated[str | None, typer.Option(help="file of ROOT/ImageSets (kitti); all frames if left out")] = None,
-    results: Annotated[Path | None, typer.Option(help="also check this folder of KITTI result files")] = None,
-    version: Annotated[str | None, typer.Option(help="tables to read (nuscenes); those there if left out")] = None,
+    dataset: Annotated[str, typer.Argument(help="kitti:ROOT, nuscenes:ROOT or another installed kind")],
+    split: Annotated[str | None, typer.Option(help="split of the dataset; all frames if left out")] = None,
+    results: Annotated[Path | None, typer.Option(help="also check these result files")] = None,
+    tables: Annotated[str | None, typer.Option(help="nuScenes: folder of tables; the only one if left out")] = None,
     json_: Annotated[bool, typer.Option("--json", help="print the findings as JSON")] = False,
 ) -> None:
     """Look a dataset over before it costs an evening: files, shapes, calibration against labels and scans.
@@ -27,34 +27,20 @@ def check(
     import json
     from dataclasses import asdict
 
-    from lcf3d.datasets.opening import parse_dataset
+    from rich.progress import Progress
 
-    kind, root = parse_dataset(dataset)
-    findings = _check_kitti(root, split, results, quiet=json_) if kind == "kitti" else _check_nuscenes(root, version)
+    from lcf3d.datasets.opening import open_dataset
+
+    data = open_dataset(dataset, split=split, version=tables)
+    with Progress(disable=json_) as progress:
+        task = progress.add_task("checking", total=len(data))
+        findings = data.check(results, lambda: progress.advance(task))
     if json_:
         typer.echo(json.dumps([asdict(finding) for finding in findings], indent=2))
     else:
         _print(findings)
     if any(finding.severity == "error" for finding in findings):
         raise typer.Exit(1)
-
-
-def _check_kitti(root: Path, split: str | None, results: Path | None, quiet: bool) -> list[Finding]:
-    from rich.progress import Progress
-
-    from lcf3d.datasets.kitti import KittiDataset
-    from lcf3d.datasets.kitti_check import check_kitti
-
-    data = KittiDataset(root, split)
-    with Progress(disable=quiet) as progress:
-        task = progress.add_task("checking", total=len(data))
-        return check_kitti(data, results, lambda: progress.advance(task))
-
-
-def _check_nuscenes(root: Path, version: str | None) -> list[Finding]:
-    from lcf3d.datasets.nuscenes_check import check_nuscenes
-
-    return check_nuscenes(root, version)
 
 
 def _print(findings: list[Finding]) -> None:

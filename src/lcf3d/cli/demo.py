@@ -99,9 +99,9 @@ def _examples(result: DemoResult) -> list[str]:
     """Sentences on matched, recovered and doubted boxes of the frame with most recovered ones."""
     import numpy as np
 
-    from lcf3d.provenance import Stage
+    from lcf3d.provenance import Outcome
 
-    item = max(result.frames, key=lambda f: int((f.fused.stages == Stage.RECOVERED).sum()))
-    stages = (Stage.MATCHED, Stage.RECOVERED, Stage.KEPT)
-    chosen = [int(i) for stage in stages for i in np.flatnonzero(item.fused.stages == stage)[:2]]
+    item = max(result.frames, key=lambda f: int((f.fused.outcomes == Outcome.RECOVERED).sum()))
+    outcomes = (Outcome.MATCHED, Outcome.RECOVERED, Outcome.KEPT)
+    chosen = [int(i) for outcome in outcomes for i in np.flatnonzero(item.fused.outcomes == outcome)[:2]]
     return [f"frame {item.frame.id}: {item.fused.explain(i)}" for i in chosen]

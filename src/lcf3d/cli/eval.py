@@ -2,35 +2,37 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from lcf3d.errors import ConfigError
 
+if TYPE_CHECKING:
+    from lcf3d.datasets.base import Dataset
+    from lcf3d.evaluation.protocol import ComparisonRow, ResultSet, TableData
+
 
 def eval(
-    dataset: Annotated[str, typer.Argument(help="kitti:ROOT (holds training/label_2) or nuscenes:ROOT")],
+    dataset: Annotated[str, typer.Argument(help="kitti:ROOT, nuscenes:ROOT or another installed kind, with labels")],
     results: Annotated[
-        list[Path], typer.Argument(help="KITTI: folder of result files, or a folder of 'lcf3d run'; nuScenes: a .json")
+        list[Path], typer.Argument(help="results in the dataset's form, or a folder of 'lcf3d run'; two with --compare")
     ],
-    split: Annotated[
-        str | None, typer.Option(help="KITTI: a list in ROOT/ImageSets; nuScenes: a split or a file of scene names")
-    ] = None,
-    class_: Annotated[list[str] | None, typer.Option("--class", help="only this class; repeatable (KITTI)")] = None,
+    split: Annotated[str | None, typer.Option(help="split of the dataset; that of the run or the usual one")] = None,
+    class_: Annotated[list[str] | None, typer.Option("--class", help="only this class; repeatable")] = None,
     iou: Annotated[
         list[str] | None, typer.Option(help="IoU threshold, Car=0.5 or Car:3d=0.5 for one measure; repeatable (KITTI)")
     ] = None,
-    missing: Annotated[str, typer.Option(help="frames without a result file: error, or empty (KITTI)")] = "error",
-    compare: Annotated[bool, typer.Option("--compare", help="two results side by side (KITTI)")] = False,
+    missing: Annotated[str, typer.Option(help="frames without results: error, or empty")] = "error",
+    compare: Annotated[bool, typer.Option("--compare", help="two results side by side, with intervals")] = False,
     samples: Annotated[int, typer.Option(min=1, help="bootstrap resamples of --compare")] = 1000,
     seed: Annotated[int, typer.Option(min=0, help="seed of the resampling")] = 0,
-    out: Annotated[Path | None, typer.Option(help="folder for the metrics and, for KITTI, report.html")] = None,
-    worst: Annotated[int, typer.Option(min=0, help="frames with most errors in the report (KITTI)")] = 8,
-    version: Annotated[str | None, typer.Option(help="folder of tables (nuScenes)")] = None,
-    front: Annotated[bool, typer.Option("--front", help="only the front camera's view (nuScenes)")] = False,
+    out: Annotated[Path | None, typer.Option(help="folder for metrics.json and report.html")] = None,
+    worst: Annotated[int, typer.Option(min=0, help="frames with most errors in the report")] = 8,
+    tables: Annotated[str | None, typer.Option(help="nuScenes: folder of tables; the only one if left out")] = None,
+    front: Annotated[bool, typer.Option("--front", help="only what the front camera sees (not KITTI)")] = False,
     nds_hat: Annotated[bool, typer.Option("--nds-hat", help="NDS^: no velocity, no attributes")] = False,
     json_: Annotated[bool, typer.Option("--json", help="print the metrics as JSON")] = False,
 ) -> None:
@@ -42,36 +44,119 @@ def eval(
 
     Example: lcf3d eval nuscenes:NUSCENES results.json
     """
-    from lcf3d.datasets.opening import parse_dataset
+    import json
 
-    kind, root = parse_dataset(dataset)
-    _check_count(results, compare)
-    if kind == "nuscenes":
-        from lcf3d.cli.eval_nuscenes import eval_nuscenes
+    from lcf3d.cli.console import console, print_table
+    from lcf3d.datasets.base import require_missing
+    from lcf3d.datasets.opening import open_dataset
+    from lcf3d.evaluation.protocol import EvaluationOptions, open_evaluation
 
-        refused = {"--class": class_, "--iou": iou, "--missing": missing != "error", "--compare": compare}
-        _refuse("nuScenes", refused)
-        eval_nuscenes(
-            root, results[0], version=version, split=split, front=front, nds_hat=nds_hat, as_json=json_, out=out
-        )
+    _check(results, compare, out)
+    require_missing(missing)
+    options = EvaluationOptions(tuple(class_ or ()), tuple(iou or ()), front, nds_hat)
+    split, frames, whole = _frames_of_run(results[0], split)
+    data = open_dataset(dataset, split=split, version=tables)
+    evaluation = open_evaluation(data, frames or (data.ids if whole else None), options)
+    names = result_names(results)
+    sets = [evaluation.read(path.expanduser(), name, missing) for path, name in zip(results, names, strict=True)]
+    rows = evaluation.compare(sets[0], sets[1], samples, seed) if compare else []
+    content: dict[str, Any] = {"results": [{"results": one.name, "metrics": one.to_json()} for one in sets]}
+    if compare:
+        content["comparison"] = {"samples": samples, "seed": seed, "rows": [_row_json(row) for row in rows]}
+    if out is not None:
+        _write(data, sets, rows, content, out, worst)
+    if json_:
+        typer.echo(json.dumps(content, indent=2))
         return
-    from lcf3d.cli.eval_kitti import KittiQuestion, eval_kitti
-
-    _refuse("KITTI", {"--version": version, "--front": front})
-    if nds_hat:
-        _refuse("--nds-hat", {"--compare": compare, "--iou": iou})
-    question = KittiQuestion(root, tuple(results), split, tuple(class_ or ()), tuple(iou or ()), missing)
-    eval_kitti(question, compare, samples, seed, out, worst, nds_hat, json_)
+    shown = [comparison_table(rows, names, samples)] if compare else [t for one in sets for t in one.tables()]
+    for table in shown:
+        print_table(table)
+    if out is not None:
+        console().print(f"wrote {out}/report.html and {out}/metrics.json", soft_wrap=True)
 
 
-def _check_count(results: Sequence[Path], compare: bool) -> None:
+def _check(results: Sequence[Path], compare: bool, out: Path | None) -> None:
     if compare and len(results) != 2:
         raise ConfigError(f"--compare needs two results, got {len(results)}")
     if not compare and len(results) > 1:
         raise ConfigError(f"got {len(results)} results; give one, or two with --compare")
+    if out is not None and out.exists() and not out.is_dir():
+        raise ConfigError(f"--out needs a folder, {out} is a file")
 
 
-def _refuse(kind: str, options: Mapping[str, object]) -> None:
-    for name, given in options.items():
-        if given:
-            raise ConfigError(f"{name} does not go with {kind}; leave it out")
+def _frames_of_run(results: Path, split: str | None) -> tuple[str | None, tuple[str, ...] | None, bool]:
+    """Split and frames that ``lcf3d run`` noted beside its results, and whether it ran on the whole dataset."""
+    from lcf3d.run.folder import RunFolder
+
+    folder = run_folder(results)
+    if split is not None or not RunFolder.is_run(folder):
+        return split, None, False
+    request = RunFolder(folder).request()
+    frames = tuple(str(frame_id) for frame_id in request.get("frames") or ())
+    noted = request.get("split")
+    noted = noted if isinstance(noted, str) else None
+    return noted, frames or None, noted is None and not frames
+
+
+def run_folder(results: Path) -> Path:
+    """The folder above ``data``, where provenance and settings of a run lie."""
+    return results.parent if results.name in ("data", "results.json") else results
+
+
+def result_names(results: Sequence[Path]) -> list[str]:
+    """Short, different names: the folder, without a trailing ``data``, or the whole path where those are equal."""
+    names = [(run_folder(path) if path.name == "data" else path).resolve().name for path in results]
+    return names if len(set(names)) == len(names) else [str(path) for path in results]
+
+
+def _row_json(row: ComparisonRow) -> dict[str, Any]:
+    """Plain JSON values of a row of a comparison."""
+    intervals = {name: getattr(row, name)._asdict() for name in ("first", "second", "difference")}
+    return {"class_name": row.class_name, "measure": row.measure, "difficulty": row.level, **intervals}
+
+
+def comparison_table(rows: Sequence[ComparisonRow], names: Sequence[str], samples: int) -> TableData:
+    """Two result sets side by side for people; sure differences carry a star."""
+    from lcf3d.evaluation.protocol import TableData
+
+    cells: list[tuple[str, ...] | None] = []
+    for row in rows:
+        sure = row.difference.low > 0 or row.difference.high < 0
+        cells.append(
+            (
+                row.class_name,
+                " ".join(filter(None, (row.measure, row.level))),
+                f"{row.first.value:.2f}",
+                f"{row.second.value:.2f}",
+                f"{row.difference.value:+.2f}{'*' if sure else ' '}",
+                f"{row.difference.low:+.2f} to {row.difference.high:+.2f}",
+            )
+        )
+    note = f"intervals: {samples} resamples of the frames, the same for both; * where they leave out zero"
+    columns = ("class", "", names[0], names[1], "difference", "95 % interval")
+    return TableData("AP in percent", columns, cells, (note,))
+
+
+def _write(
+    data: Dataset,
+    sets: Sequence[ResultSet],
+    rows: Sequence[ComparisonRow],
+    content: dict[str, Any],
+    out: Path,
+    worst: int,
+) -> None:
+    """The report and its numbers."""
+    from lcf3d.evaluation.pictures import worst_frame_pictures
+    from lcf3d.evaluation.report import html_report
+    from lcf3d.files import write_json, write_text
+
+    studies = [one.study() for one in sets]
+    pictures = worst_frame_pictures(studies[-1], data, worst)
+    looked = [{**known, **study.to_json()} for known, study in zip(content["results"], studies, strict=True)]
+    write_json(out / "metrics.json", {**content, "results": looked})
+    title = f"{studies[0].heading}: {' and '.join(study.name for study in studies)}"
+    write_text(out / "report.html", html_report(title, studies, [one.tables() for one in sets], rows, pictures))
+    details = getattr(sets[-1], "details_json", None)
+    if details is not None:
+        write_json(out / "metrics_summary.json", sets[-1].to_json())
+        write_json(out / "metrics_details.json", details(), indent=None)

@@ -15,21 +15,22 @@ if TYPE_CHECKING:
 
 
 def run(
-    dataset: Annotated[str, typer.Argument(help="kitti:ROOT or nuscenes:ROOT")],
+    dataset: Annotated[str, typer.Argument(help="kitti:ROOT, nuscenes:ROOT or another installed kind")],
     lidar: Annotated[str, typer.Option(help="LiDAR detector, kind:argument, for example results:DIR")],
     out: Annotated[Path, typer.Option(help="folder for results, provenance and settings")],
     camera: Annotated[
         str | None, typer.Option(help="camera detector, kind:argument, for example results:DIR or onnx:FILE")
     ] = None,
-    camera_left: Annotated[str | None, typer.Option(help="stereo: detector of the left camera (kitti)")] = None,
-    camera_right: Annotated[str | None, typer.Option(help="stereo: detector of the right camera (kitti)")] = None,
+    camera_left: Annotated[str | None, typer.Option(help="stereo pair: detector of the left camera")] = None,
+    camera_right: Annotated[str | None, typer.Option(help="stereo pair: detector of the right camera")] = None,
     split: Annotated[
         str | None, typer.Option(help="file of ROOT/ImageSets, or nuScenes split; all if left out")
     ] = None,
-    version: Annotated[str | None, typer.Option(help="folder of nuScenes tables; the only one if left out")] = None,
+    tables: Annotated[str | None, typer.Option(help="nuScenes: folder of tables; the only one if left out")] = None,
     frame: Annotated[list[str] | None, typer.Option(help="only this frame; repeatable")] = None,
     config: Annotated[
-        str | None, typer.Option(help="preset (paper, kitti, nuscenes) or YAML file; the dataset's preset if left out")
+        str | None,
+        typer.Option(help="preset (default, paper, kitti, nuscenes) or YAML file; the dataset's if left out"),
     ] = None,
     set_: Annotated[list[str] | None, typer.Option("--set", help="change a setting, name=value; repeatable")] = None,
     recovery: Annotated[str | None, typer.Option(help="on or off; off needs no scans")] = None,
@@ -67,7 +68,7 @@ def run(
         lidar=lidar,
         cameras=_cameras(camera, camera_left, camera_right),
         split=split,
-        version=version,
+        tables=tables,
         frames=tuple(frame or ()),
         config=config,
         changes=tuple(set_ or ()),
@@ -91,9 +92,9 @@ def run(
 
 
 def _cameras(camera: str | None, left: str | None, right: str | None) -> dict[str, str]:
-    """The detector of each camera: one for the left camera (or all six), or one of each side of a stereo pair."""
+    """The detector of each camera: one for all that the dataset uses, or one of each side of a stereo pair."""
     if camera and not (left or right):
-        return {"left": camera}
+        return {"*": camera}
     if left and right and not camera:
         return {"left": left, "right": right}
     raise ConfigError("name the camera branch with --camera, or with both --camera-left and --camera-right")
@@ -130,22 +131,23 @@ def _draw(prepared: Run, quiet: bool) -> None:
 
 def _print(counts: dict[str, Any]) -> None:
     """The summary for people."""
-    from rich.console import Console
     from rich.table import Table
+
+    from lcf3d.cli.console import console
 
     outputs = counts["outputs"]
     done = f", {counts['already_done']} were done before" if counts["already_done"] else ""
     table = Table("class", title=f"{counts['frames']} frames fused{done}")
-    for stage in outputs:
-        table.add_column(stage, justify="right")
+    for outcome in outputs:
+        table.add_column(outcome, justify="right")
     for name in sorted({name for by_class in outputs.values() for name in by_class}):
         table.add_row(name, *(str(by_class.get(name, 0)) for by_class in outputs.values()))
-    console = Console()
-    console.print(table)
+    out = console()
+    out.print(table)
     for reason, count in counts["dropped_lidar"].items():
-        console.print(f"dropped LiDAR detections, {reason.replace('_', ' ')}: {count}")
+        out.print(f"dropped LiDAR detections, {reason.replace('_', ' ')}: {count}")
     for note, count in counts["notes"].items():
-        console.print(f"in {count} frames: {note}", soft_wrap=True)
+        out.print(f"in {count} frames: {note}", soft_wrap=True)
     if counts["median_ms"]:
-        console.print("median ms a frame: " + ", ".join(f"{k} {v:.1f}" for k, v in counts["median_ms"].items()))
-    console.print(f"results in {counts['out']}", soft_wrap=True)
+        out.print("median ms a frame: " + ", ".join(f"{k} {v:.1f}" for k, v in counts["median_ms"].items()))
+    out.print(f"results in {counts['out']}", soft_wrap=True)

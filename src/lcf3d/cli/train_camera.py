@@ -102,11 +102,9 @@ def _simulated_images(frames: int, seed: int, root: Path | None, jobs: int, mask
 
 
 def _kitti_images(dataset: str, split: str) -> list[LabelledImage]:
-    from lcf3d.datasets.opening import parse_dataset
+    from lcf3d.datasets.opening import root_of
     from lcf3d.training.camera import INPUT_SIZE
     from lcf3d.training.camera_images import read_kitti
 
-    kind, root = parse_dataset(dataset)
-    if kind != "kitti":
-        raise ConfigError(f"lcf3d train camera reads kitti:ROOT or simulates its images, got {dataset!r}")
+    _, root = root_of(dataset, ("kitti",), "lcf3d train camera")
     return read_kitti(root, split, INPUT_SIZE)

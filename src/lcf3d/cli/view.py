@@ -11,17 +11,16 @@ import typer
 from lcf3d.errors import ConfigError, DatasetError
 
 if TYPE_CHECKING:
-    from lcf3d.datasets.kitti import KittiDataset
-    from lcf3d.datasets.nuscenes import NuscenesDataset
+    from lcf3d.datasets.base import CameraSource, Dataset, LidarSource
     from lcf3d.structures import Frame
     from lcf3d.visualization.scene import Scene
 
 
 def view(
-    source: Annotated[str, typer.Argument(help="kitti:ROOT, nuscenes:ROOT, or a folder written by lcf3d run")],
+    source: Annotated[str, typer.Argument(help="kind:ROOT, for example kitti:ROOT, or a folder written by lcf3d run")],
     frame: Annotated[list[str] | None, typer.Option(help="this frame; repeatable; a run's frames if left out")] = None,
     results: Annotated[
-        Path | None, typer.Option(help="what to draw: a run folder, KITTI result files or a nuScenes JSON")
+        Path | None, typer.Option(help="what to draw: a run folder, or results in the form of the dataset")
     ] = None,
     out: Annotated[
         Path | None, typer.Option(help="a .png file for one frame, else a folder; by default ID.png or RUN/pictures")
@@ -42,12 +41,13 @@ def view(
     """
     from rich.progress import Progress
 
+    from lcf3d.datasets.opening import open_dataset
     from lcf3d.visualization.png import draw_frame, save_png
 
     run_folder = _run_folder(source)
     if run_folder and results:
         raise ConfigError(f"{source} is a run folder and holds its own results; leave --results out")
-    dataset = _open_run(run_folder) if run_folder else _open(source)
+    dataset = _open_run(run_folder) if run_folder else open_dataset(source)
     shown = run_folder or results
     ids = _frame_ids(dataset, frame or [], shown, limit)
     scene_of = _scenes(dataset, shown, truth, min_score)
@@ -61,124 +61,80 @@ def view(
 
 def _run_folder(source: str) -> Path | None:
     """The path, if it is a folder written by ``lcf3d run``."""
-    path = Path(source)
-    if _is_run(path):
+    from lcf3d.run.folder import RunFolder
+
+    path = Path(source).expanduser()
+    if RunFolder.is_run(path):
         return path
-    if ":" not in source and not path.is_dir():
-        raise ConfigError(f"{source} does not exist; view takes kitti:ROOT, nuscenes:ROOT or a folder of lcf3d run")
+    if ":" not in source and not path.exists():
+        raise ConfigError(f"{source} does not exist; view takes kind:ROOT or a folder of lcf3d run")
     return None
 
 
-def _is_run(path: Path) -> bool:
-    return (path / "run.json").is_file() and (path / "provenance").is_dir()
-
-
-def _open_run(run_folder: Path) -> KittiDataset | NuscenesDataset:
+def _open_run(run_folder: Path) -> Dataset:
     """The dataset that a run was made from."""
-    from lcf3d.files import read_json
+    from lcf3d.datasets.opening import open_dataset
+    from lcf3d.run.folder import RunFolder
 
-    run = read_json(run_folder / "run.json")
-    dataset = run.get("dataset") if isinstance(run, dict) else None
-    instead = f"name it: lcf3d view kitti:ROOT --results {run_folder}"
+    run = RunFolder(run_folder).request()
+    dataset = run.get("dataset")
+    instead = f"name it: lcf3d view kind:ROOT --results {run_folder}"
     if not isinstance(dataset, str):
         raise ConfigError(f"{run_folder / 'run.json'} does not say what dataset was run; {instead}")
     try:
-        return _open(dataset)
+        return open_dataset(dataset, split=run.get("split"), version=run.get("tables", run.get("version")))
     except DatasetError as error:
         raise ConfigError(f"the dataset of this run is not there ({error}); {instead}") from None
 
 
-def _open(text: str) -> KittiDataset | NuscenesDataset:
-    from lcf3d.datasets.opening import parse_dataset
-
-    kind, root = parse_dataset(text)
-    if kind == "kitti":
-        from lcf3d.datasets.kitti import KittiDataset
-
-        return KittiDataset(root)
-    from lcf3d.datasets.nuscenes import NuscenesDataset
-
-    return NuscenesDataset(root, late_cameras="drop")
-
-
-def _frame_ids(
-    dataset: KittiDataset | NuscenesDataset, chosen: Sequence[str], shown: Path | None, limit: int | None
-) -> list[str]:
+def _frame_ids(dataset: Dataset, chosen: Sequence[str], shown: Path | None, limit: int | None) -> list[str]:
     """The frames to draw: those chosen, else those of the run."""
+    from lcf3d.datasets.base import require_frames
+    from lcf3d.run.folder import RunFolder
+
     if not chosen:
-        if shown is None or not _is_run(shown):
+        if shown is None or not RunFolder.is_run(shown):
             raise ConfigError(
                 f"name the frames to draw with --frame, for example --frame {dataset.ids[0]}; "
                 "without it, view draws the frames of a run folder"
             )
-        chosen = sorted(path.stem for path in (shown / "provenance").glob("*.json"))
+        chosen = RunFolder(shown).frame_ids()
         if not chosen:
             raise ConfigError(f"{shown} holds no finished frames yet")
-    known = set(dataset.ids)
-    for frame_id in chosen:
-        if frame_id not in known:
-            raise ConfigError(f"the dataset has no frame {frame_id!r}; its first is {dataset.ids[0]}")
-    return list(dict.fromkeys(chosen))[:limit]
+    return list(require_frames(dataset, chosen, "the dataset"))[:limit]
 
 
-def _scenes(
-    dataset: KittiDataset | NuscenesDataset, shown: Path | None, truth: bool, min_score: float
-) -> Callable[[Frame], Scene]:
+def _scenes(dataset: Dataset, shown: Path | None, truth: bool, min_score: float) -> Callable[[Frame], Scene]:
     """What to draw over a frame."""
-    from lcf3d.datasets.kitti import KittiDataset
+    from lcf3d.run.folder import RunFolder
     from lcf3d.structures import Detections3D
     from lcf3d.visualization.scene import Scene
 
     if shown is not None and not shown.exists():
-        raise ConfigError(f"{shown} does not exist; --results takes a run folder, KITTI result files or nuScenes JSON")
+        raise ConfigError(f"{shown} does not exist; --results takes a run folder or result files of the dataset's form")
     if shown is None:
         return lambda frame: Scene.from_detections(Detections3D.empty(()), truth=frame.labels if truth else None)
-    if _is_run(shown):
-        from lcf3d.run.folder import RunFolder
-
+    if RunFolder.is_run(shown):
         folder = RunFolder(shown)
         return lambda frame: Scene.from_fused(folder.read(frame.id), frame.labels if truth else None, min_score)
-    if isinstance(dataset, KittiDataset):
-        return _kitti_scenes(dataset, shown, truth, min_score)
-    return _nuscenes_scenes(dataset, shown, truth, min_score)
-
-
-def _kitti_scenes(dataset: KittiDataset, folder: Path, truth: bool, min_score: float) -> Callable[[Frame], Scene]:
-    """KITTI result files: 3D boxes where they have them, else 2D boxes in the left camera."""
-    from lcf3d.formats.kitti import detections_2d, detections_3d, read_objects
-    from lcf3d.visualization.scene import Scene
-
-    folder = folder / "data" if (folder / "data").is_dir() else folder
+    boxes, flat = _result_readers(dataset, shown)
 
     def scene(frame: Frame) -> Scene:
-        objects = read_objects(folder / f"{frame.id}.txt", results=True)
-        camera = frame.cameras[0]
-        flat = objects[~objects.has_box3d]
-        return Scene.from_detections(
-            detections_3d(objects, camera.camera_from_lidar, dataset.class_names),
-            {camera.name: detections_2d(flat, dataset.class_names)} if len(flat) else {},
-            frame.labels if truth else None,
-            min_score,
-        )
+        found = boxes.detect(frame) if boxes is not None else Detections3D.empty(dataset.class_names)
+        seen = {c.name: flat.detect(frame, c.name) for c in frame.cameras[:1]} if flat is not None else {}
+        return Scene.from_detections(found, seen, frame.labels if truth else None, min_score)
 
     return scene
 
 
-def _nuscenes_scenes(dataset: NuscenesDataset, path: Path, truth: bool, min_score: float) -> Callable[[Frame], Scene]:
-    """A nuScenes submission file."""
-    from lcf3d.formats.nuscenes import read_submission
-    from lcf3d.formats.nuscenes_boxes import detections_from_global, split_by_sample
-    from lcf3d.visualization.scene import Scene
-
-    boxes = split_by_sample(read_submission(path)[0])
-
-    def scene(frame: Frame) -> Scene:
-        if frame.id not in boxes:
-            raise ConfigError(f"{path} has no results for sample {frame.id}")
-        found = detections_from_global(boxes[frame.id], dataset.lidar_from_global(frame.id))
-        return Scene.from_detections(found, truth=frame.labels if truth else None, least_score=min_score)
-
-    return scene
+def _result_readers(dataset: Dataset, path: Path) -> tuple[LidarSource | None, CameraSource | None]:
+    """Result files as 3D detections, or as 2D detections where they hold no 3D boxes."""
+    try:
+        lidar = dataset.lidar_results(path, dataset.class_names, "empty")
+        lidar.detect(dataset.frame(dataset.ids[0]))
+        return lidar, None
+    except DatasetError:
+        return None, dataset.camera_results(path, dataset.class_names, "empty")
 
 
 def _paths(ids: Sequence[str], out: Path | None, run_folder: Path | None) -> dict[str, Path]:

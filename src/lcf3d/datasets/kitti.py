@@ -6,7 +6,7 @@ Any subset of the sensor folders may be there. Camera ``left`` is the left colou
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -14,6 +14,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from lcf3d.datasets.base import BaseDataset, CameraSource, LidarSource, ResultWriter, require_folder
+from lcf3d.datasets.check import Finding
 from lcf3d.datasets.images import ImageFiles, image_size
 from lcf3d.errors import DatasetError, FormatError
 from lcf3d.formats.kitti import detections_3d, read_frame_ids, read_objects
@@ -30,6 +32,7 @@ IMAGE_SIZES = {
     718.856: (1241, 376),
 }
 DEFAULT_IMAGE_SIZE = (1242, 375)
+PARTS = ("training", "testing")
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,13 +121,14 @@ def _check_image_size(path: Path, size: tuple[int, int], projection: FloatArray)
             )
 
 
-class KittiDataset(Sequence[Frame]):
+class KittiDataset(BaseDataset):
     """Frames of a KITTI-layout folder.
 
     Args:
         root: folder that holds ``training`` (or ``testing``) and, for splits, ``ImageSets``.
         split: name of a file in ``ImageSets`` (one frame id a line); None for all frames that have a calibration.
-        part: ``training`` or ``testing``.
+        part: ``training`` or ``testing``; without it the one that holds the frames of the split (``testing`` for splits
+            whose name begins with ``test``, where both do).
         class_names: classes of the ground truth that frames give.
         image_size: (width, height) of frames whose images are not there and whose calibration is none of KITTI's own.
 
@@ -132,23 +136,42 @@ class KittiDataset(Sequence[Frame]):
         DatasetError: the folder or the split does not exist.
     """
 
+    camera_names = tuple(name for name, _, _ in CAMERAS)
+    used_cameras = ("left",)
+    stereo_pair = ("left", "right")
+    preset = "kitti"
+    evaluation = "lcf3d.evaluation.kitti_task:KittiEvaluation"
+
     def __init__(
         self,
         root: Path | str,
         split: str | None = None,
         *,
-        part: str = "training",
+        part: str | None = None,
         class_names: Sequence[str] = KITTI_CLASSES,
         image_size: tuple[int, int] = DEFAULT_IMAGE_SIZE,
     ) -> None:
-        self.root = Path(root)
-        self.folder = self.root / part
+        self.root = require_folder(Path(root).expanduser())
         self.class_names = tuple(class_names)
         self.default_image_size = image_size
-        if not self.folder.is_dir():
-            raise DatasetError(f"{self.root} has no folder {part!r}; expected the KITTI object layout")
         self.split = split
-        self.ids = self._all_ids() if split is None else read_frame_ids(self._split_path(split))
+        listed = () if split is None else read_frame_ids(self._split_path(split))
+        self.folder = self.root / (part or self._part_of(listed))
+        if not self.folder.is_dir():
+            raise DatasetError(f"{self.root} has no folder {self.folder.name!r}; expected the KITTI object layout")
+        self.ids = self._all_ids() if split is None else listed
+
+    @staticmethod
+    def recognizes(root: Path) -> bool:
+        """Whether a folder looks like this layout."""
+        return any((root / part).is_dir() for part in PARTS)
+
+    def _part_of(self, listed: Sequence[str]) -> str:
+        """The part that holds the frames of a split."""
+        there = [part for part in PARTS if (self.root / part).is_dir()] or list(PARTS)
+        if self.split is not None and self.split.lower().startswith("test"):
+            there.reverse()
+        return max(there, key=lambda part: sum((self.root / part / "calib" / f"{i}.txt").is_file() for i in listed))
 
     def _split_path(self, split: str) -> Path:
         path = self.root / "ImageSets" / f"{split}.txt"
@@ -163,12 +186,6 @@ class KittiDataset(Sequence[Frame]):
             raise DatasetError(f"{self.folder / 'calib'} holds no calibration files")
         return ids
 
-    def __len__(self) -> int:
-        return len(self.ids)
-
-    def __getitem__(self, index: int) -> Frame:  # type: ignore[override]
-        return self.frame(self.ids[index])
-
     @cached_property
     def _present(self) -> dict[str, dict[str, Path]]:
         """Files by folder and frame id, listed once."""
@@ -178,17 +195,17 @@ class KittiDataset(Sequence[Frame]):
             for name in folders
         }
 
-    def require_calibrations(self) -> None:
-        """See that every frame of the split has a calibration file, before any work begins.
+    def require_complete(self, frame_ids: Sequence[str]) -> None:
+        """See that every frame has a calibration file, before any work begins.
 
         Raises:
             DatasetError: some have none; says how many and which first.
         """
         present = {p.stem for p in (self.folder / "calib").glob("*.txt")}
-        absent = [frame_id for frame_id in self.ids if frame_id not in present]
+        absent = [frame_id for frame_id in frame_ids if frame_id not in present]
         if absent:
             raise DatasetError(
-                f"{self.folder / 'calib'} lacks {len(absent)} of {len(self.ids)} frames, first {absent[0]}.txt; "
+                f"{self.folder / 'calib'} lacks {len(absent)} of {len(frame_ids)} frames, first {absent[0]}.txt; "
                 "copy the calibration files or leave those frames out of the split"
             )
 
@@ -200,6 +217,34 @@ class KittiDataset(Sequence[Frame]):
         """The image files of a frame that are there, by camera name."""
         found = {name: self._present[folder].get(frame_id) for name, folder, _ in CAMERAS}
         return {name: path for name, path in found.items() if path is not None}
+
+    def has_image(self, frame_id: str, camera: str) -> bool:
+        """Whether there is an image, without reading it."""
+        return camera in self.image_paths(frame_id)
+
+    def lidar_results(self, path: Path, class_names: Sequence[str], missing: str = "error") -> LidarSource:
+        """3D detections of KITTI result files, all read now."""
+        from lcf3d.datasets.kitti_results import KittiLidarResults
+
+        return KittiLidarResults(path, self.ids, class_names, missing)
+
+    def camera_results(self, path: Path, class_names: Sequence[str], missing: str = "error") -> CameraSource:
+        """2D detections of KITTI result files, all read now."""
+        from lcf3d.datasets.kitti_results import KittiCameraResults
+
+        return KittiCameraResults(path, self.ids, class_names, missing)
+
+    def writer(self, folder: Path) -> ResultWriter:
+        """A KITTI result file a frame."""
+        from lcf3d.datasets.kitti_results import KittiWriter
+
+        return KittiWriter(folder)
+
+    def check(self, results: Path | None = None, progress: Callable[[], None] = lambda: None) -> list[Finding]:
+        """The rules ``KIT``."""
+        from lcf3d.datasets.kitti_check import check_kitti
+
+        return check_kitti(self, results, progress)
 
     def frame(self, frame_id: str) -> Frame:
         """The frame of that id; scan, images and labels are read when first asked for.

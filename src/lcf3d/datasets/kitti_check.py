@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 
 from lcf3d.datasets.check import Finding
 from lcf3d.datasets.images import read_image
-from lcf3d.datasets.kitti import KittiDataset
 from lcf3d.errors import Lcf3dError
 from lcf3d.formats.kitti import KittiObjects, read_objects
 from lcf3d.geometry.boxes import points_in_boxes
@@ -38,8 +38,29 @@ NEAR_METRES = 30
 LEAST_IOU = 0.3
 
 
+class KittiFrames(Protocol):
+    """What the rules ask of a KITTI dataset."""
+
+    ids: tuple[str, ...]
+    folder: Path
+
+    def __len__(self) -> int: ...
+
+    def calibration(self, frame_id: str) -> object:
+        """The calibration of a frame."""
+        ...
+
+    def frame(self, frame_id: str) -> Frame:
+        """The frame of that id."""
+        ...
+
+    def image_paths(self, frame_id: str) -> dict[str, Path]:
+        """The image files of a frame, by camera name."""
+        ...
+
+
 def check_kitti(
-    dataset: KittiDataset, results: Path | None = None, progress: Callable[[], None] = lambda: None
+    dataset: KittiFrames, results: Path | None = None, progress: Callable[[], None] = lambda: None
 ) -> list[Finding]:
     """Everything that the rules find wrong with a dataset and, if given, with a folder of results for it.
 
@@ -72,7 +93,7 @@ def check_kitti(
     return findings
 
 
-def _check_frame(dataset: KittiDataset, frame: Frame, absent: dict[str, list[str]]) -> Iterator[Finding]:
+def _check_frame(dataset: KittiFrames, frame: Frame, absent: dict[str, list[str]]) -> Iterator[Finding]:
     """Findings of one frame whose calibration is readable; notes what it lacks in ``absent``."""
     yield from _check_images(dataset, frame, absent)
     label = dataset.folder / "label_2" / f"{frame.id}.txt"
@@ -97,7 +118,7 @@ def _check_frame(dataset: KittiDataset, frame: Frame, absent: dict[str, list[str
         yield from _check_points(frame, label, objects)
 
 
-def _check_images(dataset: KittiDataset, frame: Frame, absent: dict[str, list[str]]) -> Iterator[Finding]:
+def _check_images(dataset: KittiFrames, frame: Frame, absent: dict[str, list[str]]) -> Iterator[Finding]:
     paths = dataset.image_paths(frame.id)
     if "left" not in paths:
         absent["image"].append(frame.id)
@@ -162,7 +183,7 @@ def _clear(objects: KittiObjects, frame: Frame) -> np.ndarray:
     return np.flatnonzero(tall & (chosen.truncated == 0) & (chosen.occluded == 0))
 
 
-def _check_results(dataset: KittiDataset, folder: Path) -> Iterator[Finding]:
+def _check_results(dataset: KittiFrames, folder: Path) -> Iterator[Finding]:
     """Findings about a folder of result files."""
     if (folder / "data").is_dir():
         folder = folder / "data"

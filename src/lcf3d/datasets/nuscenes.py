@@ -9,7 +9,7 @@ Cameras and LiDAR of a sample are recorded at different times while the vehicle 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -17,11 +17,13 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from lcf3d.datasets.base import BaseDataset, CameraSource, LidarSource, ResultWriter, require_folder
+from lcf3d.datasets.check import Finding
 from lcf3d.datasets.images import ImageFiles
 from lcf3d.datasets.nuscenes_annotations import ground_truth_boxes
-from lcf3d.datasets.nuscenes_loading import load_tables
+from lcf3d.datasets.nuscenes_loading import find_version, load_tables
 from lcf3d.datasets.nuscenes_splits import scenes_of_split
-from lcf3d.datasets.nuscenes_tables import CAMERAS, NuscenesTables
+from lcf3d.datasets.nuscenes_tables import CAMERAS, MAX_CAMERA_DELAY_S, NuscenesTables
 from lcf3d.errors import ConfigError, DatasetError, FormatError
 from lcf3d.formats.nuscenes import read_submission, write_submission
 from lcf3d.formats.nuscenes_boxes import (
@@ -41,9 +43,6 @@ SWEEP_PERIOD_S = 0.05
 
 EGO_RADIUS_M = 1.0
 """Returns of earlier sweeps this near the sensor, in x and in y, come from the vehicle itself and are left out."""
-
-MAX_CAMERA_DELAY_S = 0.1
-"""Default of the longest accepted time in seconds between a camera image and the LiDAR sweep of its sample."""
 
 
 def read_lidar(path: Path) -> NDArray[np.float32]:
@@ -66,7 +65,7 @@ def read_lidar(path: Path) -> NDArray[np.float32]:
     return np.stack([points[:, 1], -points[:, 0], points[:, 2], points[:, 3]], axis=1)
 
 
-class NuscenesDataset(Sequence[Frame]):
+class NuscenesDataset(BaseDataset):
     """Samples of nuScenes tables as frames; the frame id is the sample token.
 
     Sensor files are opened only when a frame's points or images are asked for; files that are not there are left out.
@@ -88,6 +87,9 @@ class NuscenesDataset(Sequence[Frame]):
     """
 
     class_names = NUSCENES_CLASSES
+    camera_names = CAMERAS
+    preset = "nuscenes"
+    evaluation = "lcf3d.evaluation.nuscenes_task:NuscenesEvaluation"
 
     def __init__(
         self,
@@ -101,7 +103,7 @@ class NuscenesDataset(Sequence[Frame]):
         min_points: int = 1,
         tables: NuscenesTables | None = None,
     ) -> None:
-        self.root = Path(root)
+        self.root = require_folder(Path(root).expanduser())
         if sweeps < 0 or late_cameras not in ("error", "drop"):
             raise ConfigError(
                 f"sweeps must be 0 or more and late_cameras 'error' or 'drop', got {sweeps} and {late_cameras!r}"
@@ -124,19 +126,18 @@ class NuscenesDataset(Sequence[Frame]):
         self._position = {token: i for i, token in enumerate(self.ids)}
         self._ground_truth: dict[str, GlobalBoxes] | None = None
 
-    def __len__(self) -> int:
-        return len(self.ids)
+    @staticmethod
+    def recognizes(root: Path) -> bool:
+        """Whether a folder looks like this layout."""
+        return any(root.glob("v1.0-*"))
 
-    def __getitem__(self, index: int) -> Frame:  # type: ignore[override]
-        return self.frame(self.ids[index])
-
-    def frame(self, token: str) -> Frame:
+    def frame(self, frame_id: str) -> Frame:
         """The sample of that token; points, images and labels are read when first asked for.
 
         Raises:
             DatasetError: no such sample, or a camera too far off in time.
         """
-        row = self._sample_row(token)
+        token, row = frame_id, self._sample_row(frame_id)
         data = self.tables.sensor_data
         cameras, images = [], {}
         global_from_lidar = self.global_from_lidar(token)
@@ -156,7 +157,39 @@ class NuscenesDataset(Sequence[Frame]):
             cameras=cameras,
             images=ImageFiles(images),
             labels=(lambda: self.labels(token)) if len(self.tables.annotations.tokens) else None,
+            timestamp=1e-6 * float(data.timestamps_us[self._lidar_row(token)]),
+            world_from_lidar=global_from_lidar,
+            sequence=self.tables.scene_names[int(self.tables.samples.scenes[row])],
         )
+
+    def has_image(self, frame_id: str, camera: str) -> bool:
+        """Whether there is an image, without reading it."""
+        row = int(self.tables.samples.cameras[self._sample_row(frame_id), CAMERAS.index(camera)])
+        return row >= 0 and self._path(row).is_file()
+
+    def lidar_results(self, path: Path, class_names: Sequence[str], missing: str = "error") -> LidarSource:
+        """3D detections of a submission, or of a run folder."""
+        from lcf3d.datasets.nuscenes_results import NuscenesLidarResults
+
+        return NuscenesLidarResults(self.read_results(result_file(path), missing), class_names)
+
+    def camera_results(self, path: Path, class_names: Sequence[str], missing: str = "error") -> CameraSource:
+        """2D detections of a list by sample and camera (`lcf3d.formats.coco`)."""
+        from lcf3d.datasets.nuscenes_results import NuscenesCameraResults
+
+        return NuscenesCameraResults(path, class_names)
+
+    def writer(self, folder: Path) -> ResultWriter:
+        """One submission of all samples."""
+        from lcf3d.datasets.nuscenes_results import NuscenesWriter
+
+        return NuscenesWriter(folder, self.write_results)
+
+    def check(self, results: Path | None = None, progress: Callable[[], None] = lambda: None) -> list[Finding]:
+        """The rules ``NUS``."""
+        from lcf3d.datasets.nuscenes_check import check_nuscenes
+
+        return check_nuscenes(self.root, self.version)
 
     def points(self, token: str) -> NDArray[np.float32]:
         """(N, 4) ``x, y, z, intensity`` of a sample in the canonical frame; with sweeps (N, 5), last the age in s.
@@ -228,19 +261,26 @@ class NuscenesDataset(Sequence[Frame]):
             if row >= 0
         }
 
-    def read_results(self, path: Path) -> dict[str, Detections3D]:
+    def read_results(self, path: Path, missing: str = "error") -> dict[str, Detections3D]:
         """Detections of a submission file by sample token, each in its sample's canonical LiDAR frame.
 
-        Samples outside this dataset are left out.
+        Samples outside this dataset are left out; with ``missing="empty"`` those that it lacks have no detections.
 
         Raises:
             FormatError: not a submission (`read_submission`), or samples of this dataset are missing in it.
         """
         boxes = split_by_sample(read_submission(path)[0])
-        missing = [token for token in self.ids if token not in boxes]
-        if missing:
-            raise FormatError(f"{path} lacks {len(missing)} of {len(self)} samples, the first is {missing[0]}")
-        return {token: detections_from_global(boxes[token], self.lidar_from_global(token)) for token in self.ids}
+        absent = [token for token in self.ids if token not in boxes]
+        if absent and (missing == "error" or len(absent) == len(self)):
+            raise FormatError(
+                f"{path} lacks {len(absent)} of {len(self)} samples, the first is {absent[0]}"
+                + ("; --missing empty takes them as samples without detections" if len(absent) < len(self) else "")
+            )
+        nothing = Detections3D.empty(NUSCENES_CLASSES)
+        return {
+            token: detections_from_global(boxes[token], self.lidar_from_global(token)) if token in boxes else nothing
+            for token in self.ids
+        }
 
     def write_results(
         self, path: Path, detections: Mapping[str, Detections3D], meta: Mapping[str, Any] | None = None
@@ -287,14 +327,6 @@ class NuscenesDataset(Sequence[Frame]):
         return True
 
 
-def find_version(root: Path) -> str:
-    """Name of the one folder of tables in ``root``.
-
-    Raises:
-        DatasetError: there is none, or several.
-    """
-    versions = sorted(path.parent.name for path in root.glob("*/sample_data.json"))
-    if len(versions) != 1:
-        there = f"several ({', '.join(versions)}); name one" if versions else "none"
-        raise DatasetError(f"{root} should hold one folder of nuScenes tables such as v1.0-mini, there are {there}")
-    return versions[0]
+def result_file(path: Path) -> Path:
+    """The submission file of a run folder, or the file itself."""
+    return path / "results.json" if path.is_dir() else path

@@ -23,9 +23,8 @@ from pathlib import Path
 import numpy as np
 
 from lcf3d.datasets.check import Finding
-from lcf3d.datasets.nuscenes import MAX_CAMERA_DELAY_S, find_version
-from lcf3d.datasets.nuscenes_loading import read_tables
-from lcf3d.datasets.nuscenes_tables import CAMERAS, CHANNELS, LIDAR, NuscenesTables
+from lcf3d.datasets.nuscenes_loading import find_version, read_tables
+from lcf3d.datasets.nuscenes_tables import CAMERAS, CHANNELS, LIDAR, MAX_CAMERA_DELAY_S, NuscenesTables
 from lcf3d.errors import Lcf3dError
 
 

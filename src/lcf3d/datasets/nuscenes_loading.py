@@ -377,3 +377,16 @@ def _read_annotations(reader: _Reader, sample_index: _TokenIndex) -> tuple[tuple
         table["num_lidar_pts"] + table["num_radar_pts"],
         number_of_attribute[attributes],
     )
+
+
+def find_version(root: Path) -> str:
+    """Name of the one folder of tables in ``root``.
+
+    Raises:
+        DatasetError: there is none, or several.
+    """
+    versions = sorted(path.parent.name for path in root.glob("*/sample_data.json"))
+    if len(versions) != 1:
+        there = f"several ({', '.join(versions)}); name one" if versions else "none"
+        raise DatasetError(f"{root} should hold one folder of nuScenes tables such as v1.0-mini, there are {there}")
+    return versions[0]

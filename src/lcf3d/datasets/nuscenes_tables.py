@@ -13,6 +13,8 @@ from lcf3d.errors import ConfigError
 from lcf3d.structures import NUSCENES_CLASSES, BoolArray, FloatArray, IntArray
 
 CAMERAS = ("CAM_FRONT_LEFT", "CAM_FRONT", "CAM_FRONT_RIGHT", "CAM_BACK_LEFT", "CAM_BACK", "CAM_BACK_RIGHT")
+MAX_CAMERA_DELAY_S = 0.1
+"""Default of the longest accepted time in seconds between a camera image and the LiDAR sweep of its sample."""
 LIDAR = "LIDAR_TOP"
 CHANNELS = (*CAMERAS, LIDAR)
 BICYCLE_RACK = "static_object.bicycle_rack"

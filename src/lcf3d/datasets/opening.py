@@ -1,39 +1,71 @@
-"""Datasets named by one string: ``kind:ROOT``."""
+"""Datasets named by one string: ``kind:ARGUMENT?name=value``, or a bare path that one of them recognizes."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
+from lcf3d import plugins
+from lcf3d.datasets.base import Dataset, require_folder
 from lcf3d.errors import ConfigError, DatasetError
 
-KINDS = ("kitti", "nuscenes")
+GROUP = "lcf3d.datasets"
 
 
-def parse_dataset(text: str) -> tuple[str, Path]:
-    """Kind and root folder of ``kind:ROOT``; a bare path is guessed from what lies in it.
+def open_dataset(text: str | Path, **settings: Any) -> Dataset:
+    """The dataset that a string names.
+
+    Args:
+        text: ``kitti:ROOT``, ``nuscenes:ROOT?version=v1.0-mini``, a kind of an installed plug-in, or a bare path.
+        settings: settings of the kind, for example ``split="val"``; those that are None are left to the kind.
 
     Raises:
-        ConfigError: the kind is unknown or cannot be guessed.
+        ConfigError: the kind or a setting is unknown, or the kind cannot be told from the path.
+        DatasetError: the dataset is not there.
+    """
+    spec = named(str(text))
+    given = {name: value for name, value in settings.items() if value is not None}
+    dataset: Dataset = plugins.build(
+        GROUP, plugins.Spec(spec.kind, spec.argument, {**spec.settings, **given}), {"late_cameras": "drop"}
+    )
+    return dataset
+
+
+def root_of(text: str, kinds: Sequence[str], what: str) -> tuple[str, Path]:
+    """Kind and root folder of a dataset, for what can be done with few kinds only.
+
+    Raises:
+        ConfigError: it is of another kind; says that ``what`` reads ``kinds``.
         DatasetError: the folder does not exist.
     """
-    kind, colon, rest = text.partition(":")
-    if not colon:
-        kind, rest = _guess(Path(text)), text
-    if kind not in KINDS:
-        raise ConfigError(
-            f"unknown dataset kind {kind!r} in {text!r}; expected {' or '.join(f'{k}:ROOT' for k in KINDS)}"
-        )
-    root = Path(rest)
-    if not root.is_dir():
-        raise DatasetError(f"dataset folder {root} does not exist")
-    return kind, root
+    spec = named(text)
+    if spec.kind not in kinds:
+        raise ConfigError(f"{what} reads {' or '.join(f'{kind}:ROOT' for kind in kinds)}, got {text!r}")
+    return spec.kind, require_folder(Path(spec.argument).expanduser())
 
 
-def _guess(root: Path) -> str:
-    if (root / "training").is_dir() or (root / "testing").is_dir():
-        return "kitti"
-    if any(root.glob("v1.0-*")):
-        return "nuscenes"
-    raise ConfigError(
-        f"cannot tell what dataset {str(root)!r} is; name it as {' or '.join(f'{k}:ROOT' for k in KINDS)}"
-    )
+def named(text: str) -> plugins.Spec:
+    """The parts of a string that names a dataset; the kind of a bare path is told from what lies there."""
+    if Path(text).expanduser().exists():
+        return plugins.Spec(_recognize(Path(text).expanduser()), text)
+    spec = plugins.parse(text)
+    if not spec.argument and spec.kind not in plugins.kinds(GROUP):
+        raise DatasetError(f"there is no {text}; name a dataset as {_examples()}")
+    return spec
+
+
+def _recognize(root: Path) -> str:
+    for kind in plugins.kinds(GROUP):
+        try:
+            recognizes = getattr(plugins.load(GROUP, kind), "recognizes", None)
+        except Exception:
+            # a plug-in that cannot be imported recognizes nothing; asked for by name, it says why
+            continue
+        if recognizes is not None and recognizes(root):
+            return kind
+    raise ConfigError(f"cannot tell what dataset {str(root)!r} is; name it as {_examples()}")
+
+
+def _examples() -> str:
+    return " or ".join(f"{kind}:ROOT" for kind in plugins.kinds(GROUP))

@@ -177,8 +177,8 @@ def measure(frames: list[DemoFrame]) -> DemoResult:
     metrics = {
         name: evaluate_generalization([t for t in truth if t is not None], results) for name, results in found.items()
     }
-    stages = {name: float(np.median([f.milliseconds[name] for f in frames])) for name in frames[0].milliseconds}
-    return DemoResult(frames, metrics, milliseconds, stages)
+    outcomes = {name: float(np.median([f.milliseconds[name] for f in frames])) for name in frames[0].milliseconds}
+    return DemoResult(frames, metrics, milliseconds, outcomes)
 
 
 def write_pictures(frames: Sequence[DemoFrame], folder: Path) -> list[Path]:

@@ -2,32 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from lcf3d.evaluation.calibration_study import average_precisions, result_objects
-from lcf3d.evaluation.kitti import evaluate
-from lcf3d.formats.kitti import KittiFrames
+from lcf3d.evaluation.protocol import Evaluation
 from lcf3d.fusion.calibration import Calibration
 from lcf3d.fusion.clustering import cluster_boxes
 from lcf3d.fusion.config import FusionConfig
 from lcf3d.fusion.localizer import Localizer
 from lcf3d.fusion.pipeline import LateCascadeFusion
-from lcf3d.provenance import Stage
+from lcf3d.provenance import Outcome
 from lcf3d.structures import Detections2D, Detections3D, Frame
 
 Progress = Callable[[Sequence[int]], Iterable[int]]
 
 
 class AblationInput(NamedTuple):
-    """One frame with the detections of both branches; the 2D ones are of its first camera."""
+    """One frame with the detections of both branches, the 2D ones by camera."""
 
     frame: Frame
     lidar: Detections3D
-    camera: Detections2D
+    camera: Mapping[str, Detections2D]
 
 
 class Variant(NamedTuple):
@@ -51,7 +49,7 @@ class AblationRow:
     Attributes:
         group: heading.
         name: what was varied.
-        ap: 3D AP R40 easy, moderate, hard by class, in percent; NaN where there are no detections of a class.
+        ap: figures of the evaluation by class, in percent; NaN where there are no detections of a class.
         matched: output boxes that a camera detection confirms.
         recovered: output boxes found from camera detections alone.
         kept: output boxes of the LiDAR branch that nothing confirms.
@@ -59,7 +57,7 @@ class AblationRow:
 
     group: str
     name: str
-    ap: dict[str, tuple[float, float, float]]
+    ap: dict[str, tuple[float, ...]]
     matched: int = 0
     recovered: int = 0
     kept: int = 0
@@ -115,18 +113,18 @@ def variants(config: FusionConfig, scans: bool, masks: bool) -> list[Variant]:
 
 def ablate(
     inputs: Sequence[AblationInput],
-    truth: KittiFrames,
+    evaluation: Evaluation,
     config: FusionConfig,
     calibration: Calibration | None = None,
     localizer: Localizer | None = None,
     progress: Progress = lambda indices: indices,
     suppress: bool = False,
 ) -> list[AblationRow]:
-    """Measure all variants on frames of a KITTI-layout dataset.
+    """Measure all variants on frames of any dataset.
 
     Args:
         inputs: frames and detections.
-        truth: labels of the same frames.
+        evaluation: of the same frames.
         config: settings that the variants change.
         calibration: score calibration, see `LateCascadeFusion`.
         localizer: for recovery, see `LateCascadeFusion`.
@@ -134,12 +132,11 @@ def ablate(
         suppress: the LiDAR detections are without non-maximum suppression: LiDAR alone is measured after it.
     """
     scans = all(item.frame.points is not None for item in inputs)
-    masks = any(item.camera.masks is not None for item in inputs)
+    masks = any(seen.masks is not None for item in inputs for seen in item.camera.values())
     chosen = variants(config, scans, masks)
     alone = [suppressed(item.lidar) for item in inputs] if suppress else [item.lidar for item in inputs]
-    return [
-        _measure(inputs, alone, truth, chosen[i], config, calibration, localizer) for i in progress(range(len(chosen)))
-    ]
+    numbers = progress(range(len(chosen)))
+    return [_measure(inputs, alone, evaluation, chosen[i], config, calibration, localizer) for i in numbers]
 
 
 def suppressed(lidar: Detections3D) -> Detections3D:
@@ -150,27 +147,28 @@ def suppressed(lidar: Detections3D) -> Detections3D:
 def _measure(
     inputs: Sequence[AblationInput],
     alone: Sequence[Detections3D],
-    truth: KittiFrames,
+    evaluation: Evaluation,
     variant: Variant,
     config: FusionConfig,
     calibration: Calibration | None,
     localizer: Localizer | None,
 ) -> AblationRow:
-    stages = np.zeros(len(Stage), dtype=np.int64)
+    outcomes = np.zeros(len(Outcome), dtype=np.int64)
     results = []
     fusion = None
     if variant.changes is not None:
         fusion = LateCascadeFusion(config.updated(**variant.changes), localizer, calibration)
     for item, detections in zip(inputs, alone, strict=True):
         if fusion is not None:
-            fused = fusion(item.frame, item.lidar, {item.frame.cameras[0].name: item.camera})
+            fused = fusion(item.frame, item.lidar, item.camera)
             detections = fused.detections
-            stages += np.bincount(fused.stages, minlength=len(Stage))
-        results.append(result_objects(item.frame, detections))
-    metrics = evaluate(truth, KittiFrames.from_frames(truth.frame_ids, results))
+            outcomes += np.bincount(fused.outcomes, minlength=len(Outcome))
+        results.append(detections)
+    figures = evaluation.figures(results)
+    unknown = (float("nan"),) * len(evaluation.columns)
     return AblationRow(
         variant.group,
         variant.name,
-        {name: average_precisions(metrics, name) for name in config.class_names},
-        *(int(stages[s]) for s in (Stage.MATCHED, Stage.RECOVERED, Stage.KEPT)),
+        {name: figures.get(name, unknown) for name in config.class_names},
+        *(int(outcomes[s]) for s in (Outcome.MATCHED, Outcome.RECOVERED, Outcome.KEPT)),
     )

@@ -1,25 +1,23 @@
-"""Fitting a calibration on labelled KITTI frames, and measuring by cross-validation what it brings."""
+"""Fitting a calibration on labelled frames, and measuring by cross-validation what it brings."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from lcf3d.errors import DatasetError
-from lcf3d.evaluation.kitti import DIFFICULTIES, KittiEvaluator, KittiMetrics, Selection, evaluate
-from lcf3d.evaluation.kitti_matching import FALSE_POSITIVE, TRUE_POSITIVE
-from lcf3d.formats.kitti import KittiFrames, KittiObjects, detections_2d, detections_3d, objects_from_detections
+from lcf3d.evaluation.protocol import Evaluation, Verdict, open_evaluation
 from lcf3d.fusion.calibration import Calibration, ScoreMap, ground_height
-from lcf3d.fusion.calibration_fit import choose_map, fit_evidence, fit_map, log_loss
+from lcf3d.fusion.calibration_fit import block_folds, choose_map, fit_evidence, fit_map, log_loss
+from lcf3d.fusion.cluster_evidence import ClusterEvidence
 from lcf3d.fusion.config import FusionConfig
 from lcf3d.fusion.evidence import Evidence, to_probability
 from lcf3d.fusion.pipeline import LateCascadeFusion
-from lcf3d.fusion.weighing import Weighed
-from lcf3d.geometry.camera import project_boxes
+from lcf3d.run.setup import RunRequest, read_inputs
 from lcf3d.structures import BoolArray, Detections2D, Detections3D, FloatArray, Frame, IntArray
 
 # a class with fewer judged detections than this, or fewer right or wrong ones than a quarter of it, gets no map
@@ -28,14 +26,14 @@ FEWEST = 20
 Progress = Callable[[Sequence[int]], Iterable[int]]
 
 
-class Judged(NamedTuple):
-    """Detections of one branch over all frames, class after class judged by the official protocol.
+class Assessed(NamedTuple):
+    """Detections of one branch over all frames, judged by the dataset's protocol.
 
     Attributes:
         frames: (N,) frame of each detection.
         labels: (N,) its class.
         scores: (N,) as the detector wrote them.
-        judged: (N,) whether the protocol judges it (not DontCare, ignored objects or too small).
+        judged: (N,) whether the protocol judges it (not ignored objects, too small or too far).
         right: (N,) 1 for a true positive, else 0.
     """
 
@@ -57,7 +55,7 @@ class ClassReport:
         log_loss_before: of the LiDAR scores as they are, NaN where they are no probabilities.
         log_loss_lidar: cross-validated, of the calibrated LiDAR scores.
         log_loss_fused: cross-validated, of the fused scores of the boxes that the camera judges; NaN if none.
-        before: 3D AP R40 of the LiDAR branch alone, by difficulty.
+        before: figures of the LiDAR branch alone, see `lcf3d.evaluation.protocol.Evaluation.figures`.
         after: the same of the fusion, cross-validated.
     """
 
@@ -67,54 +65,57 @@ class ClassReport:
     log_loss_before: float
     log_loss_lidar: float
     log_loss_fused: float
-    before: tuple[float, float, float]
-    after: tuple[float, float, float]
+    before: tuple[float, ...]
+    after: tuple[float, ...]
 
 
 class CalibrationStudy:
     """Detections of two branches and the ground truth of the same frames.
 
     Args:
-        frames: with their cameras; the first camera is the one that the 2D detections are of.
-        truth: labels.
-        lidar: results with 3D boxes.
-        camera: results with 2D boxes.
+        frames: with their cameras.
+        evaluation: judges detections of these frames.
+        lidar: 3D detections by frame.
+        camera: 2D detections by camera name, of each frame.
         config: settings of the fusion.
         folds: (F,) fold of each frame, see `block_folds`.
         progress: wraps loops over frames, for a progress bar.
+        sources: where the detections of the two branches were read from, if the evaluation can use that.
+
+    Raises:
+        DatasetError: there are no 3D boxes.
     """
 
     def __init__(
         self,
         frames: Sequence[Frame],
-        truth: KittiFrames,
-        lidar: KittiFrames,
-        camera: KittiFrames,
+        evaluation: Evaluation,
+        lidar: Sequence[Detections3D],
+        camera: Sequence[Mapping[str, Detections2D]],
         config: FusionConfig,
         folds: IntArray,
         progress: Progress = lambda indices: indices,
+        sources: tuple[Any, Any] = (None, None),
     ) -> None:
-        self.frames, self.truth, self.config, self.folds = list(frames), truth, config, folds
-        self.lidar_results, self.camera_results = lidar, camera
+        self.frames, self.evaluation, self.config, self.folds = list(frames), evaluation, config, folds
+        self.lidar_inputs, self.camera_inputs, self.sources = list(lidar), list(camera), sources
         self._progress = progress
-        names = config.class_names
-        views = [frame.cameras[0] for frame in self.frames]
-        self.lidar_inputs = [detections_3d(lidar[i], view.camera_from_lidar, names) for i, view in enumerate(views)]
-        self.camera_inputs = [_clipped(detections_2d(camera[i], names), frame) for i, frame in enumerate(self.frames)]
         if not any(len(found) for found in self.lidar_inputs):
-            raise DatasetError(f"the LiDAR results hold no 3D boxes of {', '.join(names)}: nothing to calibrate")
+            names = ", ".join(config.class_names)
+            raise DatasetError(f"the LiDAR results hold no 3D boxes of {names}: nothing to calibrate")
 
     @cached_property
-    def lidar(self) -> Judged:
-        """LiDAR detections judged in 3D at the official IoU, ``hard``."""
-        taken = [np.isin(o.class_names, self.config.class_names) & o.has_box3d for o in self.lidar_results]
-        return self._judge(self.lidar_results, "3d", np.concatenate(taken), self.lidar_inputs)
+    def lidar(self) -> Assessed:
+        """LiDAR detections judged in 3D."""
+        verdict = self.evaluation.judge_lidar(self.lidar_inputs, self.sources[0])
+        return _assessed(self.lidar_inputs, range(len(self.lidar_inputs)), verdict)
 
     @cached_property
-    def camera(self) -> Judged:
-        """Camera detections judged in 2D at the official IoU, ``hard``."""
-        taken = np.isin(self.camera_results.objects.class_names, self.config.class_names)
-        return self._judge(self.camera_results, "bbox", taken, self.camera_inputs)
+    def camera(self) -> Assessed:
+        """Camera detections judged in the images."""
+        verdict = self.evaluation.judge_camera(self.camera_inputs, self.sources[1])
+        found = [(f, detections) for f, seen in enumerate(self.camera_inputs) for detections in seen.values()]
+        return _assessed([detections for _, detections in found], [f for f, _ in found], verdict)
 
     @property
     def camera_classes(self) -> tuple[str, ...]:
@@ -143,20 +144,20 @@ class CalibrationStudy:
             camera_classes=self.camera_classes,
             ground_z=ground_height(bottoms[rows]),
         )
-        weighed, places = self.weigh(calibration, np.flatnonzero(chosen))
+        weighed, places = self.evidence(calibration, np.flatnonzero(chosen))
         return calibration.model_copy(update={"evidence": self._fit_evidence(weighed, places)})
 
-    def weigh(self, calibration: Calibration, frames: IntArray) -> tuple[Weighed, IntArray]:
+    def evidence(self, calibration: Calibration, frames: IntArray) -> tuple[ClusterEvidence, IntArray]:
         """Evidence of the clusters of some frames, and the row in `lidar` of each cluster's box."""
         fusion = LateCascadeFusion(self.config, _no_localizer, calibration)
         starts = np.concatenate([[0], np.cumsum([len(found) for found in self.lidar_inputs])])
         parts, places = [], []
         for i in self._progress([int(f) for f in frames]):
             frame = self.frames[i]
-            part = fusion.weigh(frame, self.lidar_inputs[i], {frame.cameras[0].name: self.camera_inputs[i]})
+            part = fusion.evidence(frame, self.lidar_inputs[i], self.camera_inputs[i])
             parts.append(part)
             places.append(starts[i] + part.box)
-        joined = Weighed(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+        joined = ClusterEvidence(*(np.concatenate(column) for column in zip(*parts, strict=True)))
         return joined, np.concatenate(places).astype(np.int64)
 
     def cross_validate(self, final: Calibration) -> list[ClassReport]:
@@ -170,7 +171,7 @@ class CalibrationStudy:
         for fold in np.unique(self.folds):
             test = self.folds == fold
             model = self.fit(~test, like=final)
-            weighed, places = self.weigh(model, np.flatnonzero(test))
+            weighed, places = self.evidence(model, np.flatnonzero(test))
             for label, name in enumerate(self.config.class_names):
                 own = weighed.labels == label
                 rows = places[own]
@@ -185,15 +186,14 @@ class CalibrationStudy:
                 equivalents[rows] = score_map.transformed_at(level) if score_map else level
         return [self._report(name, equivalents, probabilities, alone) for name in self._present_classes()]
 
-    def fused_objects(self, scores: FloatArray) -> KittiFrames:
-        """The LiDAR boxes with other scores, NaN for none, as results with projected 2D boxes."""
+    def rescored(self, scores: FloatArray) -> list[Detections3D]:
+        """The LiDAR boxes with other scores, those of NaN left out."""
         out, start = [], 0
-        for frame, found in zip(self.frames, self.lidar_inputs, strict=True):
+        for found in self.lidar_inputs:
             own = scores[start : start + len(found)]
             start += len(found)
-            kept = ~np.isnan(own)
-            out.append(result_objects(frame, replace(found, scores=own)[kept]))
-        return KittiFrames.from_frames(self.truth.frame_ids, out)
+            out.append(replace(found, scores=own)[~np.isnan(own)])
+        return out
 
     def _present_classes(self) -> list[str]:
         return [self.config.class_names[i] for i in np.unique(self.lidar.labels)]
@@ -210,37 +210,15 @@ class CalibrationStudy:
             log_loss(scores, right) if bounded else float("nan"),
             log_loss(alone[rows], right),
             log_loss(probabilities[rows], right) if name in self.camera_classes else float("nan"),
-            average_precisions(self._metrics_before, name),
-            average_precisions(evaluate(self.truth, self.fused_objects(equivalents)), name),
+            self._before[name],
+            self.evaluation.figures(self.rescored(equivalents))[name],
         )
 
     @cached_property
-    def _metrics_before(self) -> KittiMetrics:
-        return evaluate(self.truth, self.lidar_results)
+    def _before(self) -> dict[str, tuple[float, ...]]:
+        return self.evaluation.figures(self.lidar_inputs)
 
-    def _judge(
-        self,
-        results: KittiFrames,
-        measure: str,
-        taken: BoolArray,
-        inputs: Sequence[Detections2D] | Sequence[Detections3D],
-    ) -> Judged:
-        evaluator = KittiEvaluator(self.truth, results)
-        labels = np.concatenate([found.labels for found in inputs])
-        judged, right = np.zeros(len(labels), dtype=bool), np.zeros(len(labels))
-        for label, name in enumerate(self.config.class_names):
-            if name not in evaluator.config.classes or not (labels == label).any():
-                continue
-            _, outcomes = evaluator.match_at(Selection(name, measure, "hard"), -np.inf)  # type: ignore[arg-type]
-            own = labels == label
-            outcomes = outcomes[taken]
-            judged[own] = np.isin(outcomes[own], [TRUE_POSITIVE, FALSE_POSITIVE])
-            right[own] = outcomes[own] == TRUE_POSITIVE
-        scores = np.concatenate([found.scores for found in inputs])
-        frames = np.repeat(np.arange(len(inputs)), [len(found) for found in inputs])
-        return Judged(frames, labels, scores, judged, right)
-
-    def _fit_maps(self, judged: Judged, training: BoolArray, like: dict[str, ScoreMap] | None) -> dict[str, ScoreMap]:
+    def _fit_maps(self, judged: Assessed, training: BoolArray, like: dict[str, ScoreMap] | None) -> dict[str, ScoreMap]:
         maps = {}
         for label, name in enumerate(self.config.class_names):
             rows = (judged.labels == label) & judged.judged & training[judged.frames]
@@ -252,35 +230,53 @@ class CalibrationStudy:
                 maps[name], _ = choose_map(scores, right, self.folds[judged.frames[rows]])
         return maps
 
-    def _fit_evidence(self, weighed: Weighed, places: IntArray) -> dict[str, Evidence]:
+    def _fit_evidence(self, weighed: ClusterEvidence, places: IntArray) -> dict[str, Evidence]:
         found = {}
         for label, name in enumerate(self.config.class_names):
             rows = (weighed.labels == label) & weighed.agreed & self.lidar.judged[places]
             if name in self.camera_classes and rows.sum() >= FEWEST:
-                recovered = self.config.evidence.get(name, Evidence()).recovered
+                recovered = self.config.evidence_of(name).recovered
                 right = self.lidar.right[places[rows]]
                 found[name] = fit_evidence(weighed.table[rows], right, recovered=recovered)
         return found
 
 
-def average_precisions(metrics: KittiMetrics, name: str) -> tuple[float, float, float]:
-    """3D AP R40, easy, moderate and hard."""
-    easy, moderate, hard = (metrics.ap(name, "3d", d) for d in DIFFICULTIES)
-    return easy, moderate, hard
-
-
-def result_objects(frame: Frame, detections: Detections3D) -> KittiObjects:
-    """KITTI result lines of 3D detections, 2D boxes projected into the frame's first camera."""
-    view = frame.cameras[0]
-    projected, visible = project_boxes(detections.boxes, view)
-    return objects_from_detections(detections[visible], projected[visible], view.camera_from_lidar)
-
-
-def _clipped(found: Detections2D, frame: Frame) -> Detections2D:
-    view = frame.cameras[0]
-    limits = np.array([view.width, view.height, view.width, view.height], dtype=np.float64)
-    return replace(found, boxes=np.clip(found.boxes, 0, limits))
+def _assessed(
+    found: Sequence[Detections2D] | Sequence[Detections3D], frames: Sequence[int], verdict: Verdict
+) -> Assessed:
+    labels = np.concatenate([detections.labels for detections in found])
+    scores = np.concatenate([detections.scores for detections in found])
+    numbers = np.repeat(np.array(frames, dtype=np.int64), [len(detections) for detections in found])
+    return Assessed(numbers, labels, scores, verdict.judged, verdict.right)
 
 
 def _no_localizer(proposals: object) -> tuple[FloatArray, FloatArray]:
     raise AssertionError("calibration recovers nothing")
+
+
+def open_study(request: RunRequest, folds: int = 5, progress: Progress = lambda indices: indices) -> CalibrationStudy:
+    """Read frames, labels and the detections of both branches.
+
+    Args:
+        request: dataset, branches and settings, as for a run.
+        folds: parts of the cross-validation.
+        progress: wraps loops over frames, for a progress bar.
+
+    Raises:
+        Lcf3dError: something is absent, malformed or makes no sense; one sentence says what.
+    """
+    found = read_inputs(replace(request, recovery="off"))
+    config = found.config.updated(ensemble="evidence", unmatched="downweight")
+    evaluation = open_evaluation(found.dataset, found.frame_ids)
+    frames = [found.dataset.frame(frame_id) for frame_id in found.frame_ids]
+    lidar = [found.lidar.detect(frame) for frame in frames]
+    camera = []
+    for frame in frames:
+        there = [c.name for c in frame.cameras if c.name in found.cameras and found.cameras[c.name].sees(frame, c.name)]
+        camera.append({name: found.cameras[name].detect(frame, name) for name in there})
+    drives = all(frame.sequence for frame in frames)
+    names = tuple(f"{frame.sequence}_{frame.id}" if drives else frame.id for frame in frames)
+    # the kind of each score map is chosen by cross-validation even where no report is asked for
+    parts = block_folds(names, folds or 2)
+    sources = (found.lidar, next(iter(found.cameras.values()), None))
+    return CalibrationStudy(frames, evaluation, lidar, camera, config, parts, progress, sources)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from lcf3d.structures import FloatArray, IntArray
+from lcf3d.structures import BoolArray, FloatArray, IntArray
 
 ERRORS = ("trans_err", "scale_err", "orient_err", "vel_err", "attr_err")
 """True-positive errors: metres, 1 - aligned IoU, radians, m/s, 1 - accuracy."""
@@ -143,6 +143,58 @@ def _match(
     found = matches >= 0
     matches[found] = members[matches[found]]
     return matches
+
+
+def matched_objects(
+    ground_truth: EvaluationBoxes, predictions: EvaluationBoxes, class_count: int, threshold: float
+) -> IntArray:
+    """(N,) row of the ground truth that each prediction takes within ``threshold`` metres, -1 for none."""
+    order = np.lexsort((-np.arange(len(predictions)), -predictions.scores))
+    matches = np.full(len(predictions), -1, dtype=np.int64)
+    matches[order] = _match(ground_truth, predictions, order, class_count, (threshold,))[0]
+    return matches
+
+
+def resampled_aps(
+    ground_truth: EvaluationBoxes,
+    predictions: EvaluationBoxes,
+    class_count: int,
+    thresholds: tuple[float, ...],
+    weights: IntArray,
+    min_recall: float,
+    min_precision: float,
+) -> FloatArray:
+    """(B, C, T) average precision of B data sets in which frame ``f`` appears ``weights[b, f]`` times.
+
+    A frame that is drawn twice counts twice: its objects and detections do not meet those of its copy.
+    """
+    order = np.lexsort((-np.arange(len(predictions)), -predictions.scores))
+    matches = _match(ground_truth, predictions, order, class_count, thresholds)
+    labels, frames = predictions.labels[order], predictions.frames[order]
+    aps = np.zeros((len(weights), class_count, len(thresholds)))
+    for c in range(class_count):
+        own = np.flatnonzero(labels == c)
+        objects = np.bincount(ground_truth.frames[ground_truth.labels == c], minlength=weights.shape[1])
+        for t in range(len(thresholds)):
+            hits = matches[t][own] >= 0
+            drawn, first = weights[:, frames[own]], round(100 * min_recall) + 1
+            aps[:, c, t] = _weighted_aps(hits, drawn, weights @ objects, first, min_precision)
+    return aps
+
+
+def _weighted_aps(hits: BoolArray, drawn: IntArray, objects: IntArray, first: int, min_precision: float) -> FloatArray:
+    """(B,) average precision of detections in descending score, each counted (B, N) ``drawn`` times."""
+    aps = np.zeros(len(drawn))
+    if not len(hits):
+        return aps
+    true = np.cumsum(drawn * hits, axis=1)
+    reported = np.cumsum(drawn, axis=1)
+    for b in np.flatnonzero((objects > 0) & (true[:, -1] > 0)):
+        there = drawn[b] > 0
+        recall = true[b, there] / objects[b]
+        precision = np.interp(RECALLS, recall, true[b, there] / reported[b, there], right=0)
+        aps[b] = np.maximum(precision[first:] - min_precision, 0).mean() / (1 - min_precision)
+    return aps
 
 
 @njit(cache=True, nogil=True)

@@ -5,13 +5,9 @@ from __future__ import annotations
 import shlex
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, Literal
 
-from lcf3d.datasets.kitti import KittiDataset
-from lcf3d.datasets.nuscenes import NuscenesDataset
-from lcf3d.datasets.opening import parse_dataset
-from lcf3d.detectors.named import load_detector
+from lcf3d.datasets.base import CameraSource, LidarSource
+from lcf3d.datasets.opening import named, open_dataset
 from lcf3d.errors import ConfigError, DatasetError
 from lcf3d.evaluation.domain_shift import (
     LABEL_CLASSES,
@@ -28,9 +24,7 @@ from lcf3d.fusion.calibration import Calibration, load_calibration
 from lcf3d.fusion.config import FusionConfig
 from lcf3d.fusion.pipeline import LateCascadeFusion
 from lcf3d.fusion.self_calibration import self_calibrate
-from lcf3d.plugins import parse as parse_spec
-from lcf3d.run.results import NuscenesCameraResults, NuscenesLidarResults
-from lcf3d.run.sources import CameraOnImages, CameraSource, LidarSource
+from lcf3d.run.sources import LidarOnScans, open_cameras, open_lidar
 from lcf3d.structures import KITTI_CLASSES, NUSCENES_CLASSES, Camera, Detections2D, Detections3D, Frame
 
 FRONT = {"kitti": "left", "nuscenes": "CAM_FRONT"}
@@ -121,9 +115,11 @@ class DomainTaskRunner:
             )
         self.task = task
         self.config = config
-        self.kind, root = parse_dataset(task.dataset)
-        self.front = FRONT[self.kind]
-        self.dataset = _open(self.kind, root, task.split)
+        self.kind = named(task.dataset).kind
+        self.dataset = open_dataset(task.dataset, split=task.split)
+        self.dataset.class_names = LABEL_CLASSES if self.kind == "kitti" else self.dataset.class_names
+        self.dataset.require_complete(self.dataset.ids)
+        self.front = FRONT.get(self.kind, self.dataset.used_cameras[0])
         self.lidar = self._lidar(task.lidar)
         self.camera = self._camera(task.camera) if task.camera else None
         self.fused = self._lidar(task.fused) if task.fused else None
@@ -188,39 +184,17 @@ class DomainTaskRunner:
         return self_calibrate(teaching, self.config).model_copy(update={"camera_classes": None})
 
     def _lidar(self, text: str) -> LidarSource:
-        spec = parse_spec(text)
-        if spec.kind == "results" and isinstance(self.dataset, NuscenesDataset):
-            return NuscenesLidarResults(spec.argument, self.dataset, NUSCENES_CLASSES)
-        loaded = _load(text, "lidar", self._names(spec.kind))
-        if spec.kind == "results":
-            loaded.load(self.dataset.ids)
-        if hasattr(loaded, "detect"):
-            return loaded  # type: ignore[no-any-return]
-        return AdaptedLidar(loaded, find_domain(self.kind), find_domain(self.task.trained), self.front)
+        source = open_lidar(text, self.dataset, self._names(text.partition(":")[0]))
+        if isinstance(source, LidarOnScans):
+            return AdaptedLidar(source.detector, find_domain(self.kind), find_domain(self.task.trained), self.front)
+        return source
 
     def _camera(self, text: str) -> CameraSource:
-        spec = parse_spec(text)
-        if spec.kind == "results" and isinstance(self.dataset, NuscenesDataset):
-            return NuscenesCameraResults(spec.argument, (*NUSCENES_CLASSES, *KITTI_CLASSES))
-        loaded = _load(text, "camera", (*KITTI_CLASSES, *NUSCENES_CLASSES) if spec.kind == "results" else KITTI_CLASSES)
-        if spec.kind == "results":
-            loaded.load(self.dataset.ids)
-        return loaded if hasattr(loaded, "detect") else CameraOnImages(loaded)
+        names = (*KITTI_CLASSES, *NUSCENES_CLASSES) if text.startswith("results:") else KITTI_CLASSES
+        return open_cameras({self.front: text}, self.dataset, names)[self.front]
 
     def _names(self, kind: str) -> Sequence[str]:
         """Class names to ask of a LiDAR detector: those it was trained with, or of files of either vocabulary."""
         if kind == "results":
             return (*KITTI_CLASSES, *NUSCENES_CLASSES)
         return KITTI_CLASSES if find_domain(self.task.trained).name == "kitti" else NUSCENES_CLASSES
-
-
-def _open(kind: str, root: Path, split: str | None) -> KittiDataset | NuscenesDataset:
-    if kind == "nuscenes":
-        return NuscenesDataset(root, split=split, late_cameras="drop")
-    dataset = KittiDataset(root, split, class_names=LABEL_CLASSES)
-    dataset.require_calibrations()
-    return dataset
-
-
-def _load(text: str, sensor: Literal["lidar", "camera"], class_names: Sequence[str]) -> Any:
-    return load_detector(text, sensor, class_names)

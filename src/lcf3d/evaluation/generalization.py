@@ -118,8 +118,8 @@ def evaluate_generalization(
         )
     names = tuple(ground_truth[0].class_names if class_names is None else class_names)
     limits = np.array([class_range.get(name, DEFAULT_RANGE) for name in names], dtype=np.float64)
-    truth = _join(ground_truth, names, limits, cameras)
-    found = _join(predictions, names, limits, cameras)
+    truth = join_frames(ground_truth, names, limits, cameras)
+    found = join_frames(predictions, names, limits, cameras)
     if np.isnan(found.scores).any():
         raise ConfigError(f"{int(np.isnan(found.scores).sum())} predictions have the score NaN; expected numbers")
     half_turn = frozenset(names.index(name) for name in OFFICIAL.half_turn if name in names)
@@ -141,7 +141,7 @@ def in_camera_view(detections: Detections3D, camera: Camera) -> Detections3D:
     return detections[((pixels >= 0) & (pixels < [camera.width, camera.height])).all(axis=1)]
 
 
-def _join(
+def join_frames(
     frames: Sequence[Detections3D], names: tuple[str, ...], limits: FloatArray, cameras: Sequence[Camera] | None
 ) -> EvaluationBoxes:
     """All frames' detections of the given classes, within range and view."""

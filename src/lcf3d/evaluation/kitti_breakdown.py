@@ -4,18 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from lcf3d.errors import DatasetError
 from lcf3d.evaluation.bootstrap import DEFAULT_SAMPLES, Interval, frame_weights, resampled_ap
 from lcf3d.evaluation.curves import Sampling, precision_curve
-from lcf3d.evaluation.kitti import MEASURES, KittiEvaluator, Selection
+from lcf3d.evaluation.kitti import MEASURE_NAMES, MEASURES, KittiEvaluator, Selection
+from lcf3d.evaluation.protocol import ComparisonRow
+from lcf3d.evaluation.study import DISTANCE_RANGES, DistanceRow
 from lcf3d.structures import FloatArray
 
 IOU_THRESHOLDS = tuple(i / 10 for i in range(1, 10))
-DISTANCE_RANGES = ((0.0, 20.0), (20.0, 40.0), (40.0, float("inf")))
 
 
 def ap_over_iou(
@@ -28,24 +29,6 @@ def ap_over_iou(
     ]
 
 
-@dataclass(frozen=True)
-class DistanceRow:
-    """AP within one range of distances on the ground from the camera.
-
-    Attributes:
-        near: metres, included.
-        far: metres, not included.
-        ap: R40, percent.
-        objects: ground-truth objects of the difficulty in the range; with fewer than 41 the official sampling cannot
-            reach 100.
-    """
-
-    near: float
-    far: float
-    ap: float
-    objects: int
-
-
 def ap_by_distance(
     evaluator: KittiEvaluator, selection: Selection, ranges: Sequence[tuple[float, float]] = DISTANCE_RANGES
 ) -> list[DistanceRow]:
@@ -55,27 +38,6 @@ def ap_by_distance(
         curve, _ = precision_curve(evaluator.events(replace(selection, distance_range=(near, far))))
         rows.append(DistanceRow(near, far, curve.average_precision(), curve.object_count))
     return rows
-
-
-@dataclass(frozen=True)
-class ComparisonRow:
-    """One number of two result sets and how sure their difference is.
-
-    Attributes:
-        class_name: evaluated class.
-        measure: ``bbox``, ``aos``, ``bev`` or ``3d``.
-        difficulty: ``easy``, ``moderate`` or ``hard``.
-        first: AP of the first result set, percent, with its interval.
-        second: the same of the second.
-        difference: second minus first, with the interval of the paired difference (the same frames drawn for both).
-    """
-
-    class_name: str
-    measure: str
-    difficulty: str
-    first: Interval
-    second: Interval
-    difference: Interval
 
 
 def compare(
@@ -112,15 +74,15 @@ def compare(
             if measure == "aos" and not (selection.measure == "bbox" and _both_cover(first, second, selection, "aos")):
                 continue
             intervals = [Interval.of(v[0], v[1:]) for v in (a, b, b - a)]
-            result.append(ComparisonRow(selection.class_name, measure, selection.difficulty, *intervals))
+            result.append(ComparisonRow(selection.class_name, MEASURE_NAMES[measure], selection.difficulty, *intervals))
         return result
 
     common = [s for s in first.selections() if _both_cover(first, second, s, s.measure)]
     _ = first.overlap, second.overlap  # computed once, before the threads start
     with ThreadPoolExecutor(2) as pool:
         found = [row for part in pool.map(rows, common) for row in part]
-    classes = list(first.covered)
-    return sorted(found, key=lambda row: (classes.index(row.class_name), MEASURES.index(row.measure)))
+    classes, names = list(first.covered), [MEASURE_NAMES[measure] for measure in MEASURES]
+    return sorted(found, key=lambda row: (classes.index(row.class_name), names.index(row.measure)))
 
 
 def _both_cover(first: KittiEvaluator, second: KittiEvaluator, selection: Selection, measure: str) -> bool:

@@ -20,7 +20,7 @@ from lcf3d.structures import FloatArray, IntArray
 OTHER, COUNTS, IGNORED = -1, 0, 1
 
 # what became of a detection at one score threshold
-BELOW, TRUE_POSITIVE, FALSE_POSITIVE, NOT_JUDGED = 0, 1, 2, 3
+BELOW, TRUE_POSITIVE, FALSE_POSITIVE, NOT_COUNTED = 0, 1, 2, 3
 
 
 def pair_starts(truth: KittiFrames, results: KittiFrames) -> IntArray:
@@ -110,7 +110,7 @@ def match_at(
 
     Returns:
         (N,) row of the detection matched with each object or -1, and (M,) what became of each detection: `BELOW` the
-        threshold, `TRUE_POSITIVE`, `FALSE_POSITIVE`, or `NOT_JUDGED` (another class, too small, or matched with an
+        threshold, `TRUE_POSITIVE`, `FALSE_POSITIVE`, or `NOT_COUNTED` (another class, too small, or matched with an
         ignored object or DontCare region).
     """
     scores = results.objects.scores
@@ -340,7 +340,7 @@ def _match_at(  # type: ignore[no-untyped-def]
     candidates, candidate_overlaps = np.empty(widest, np.int64), np.empty(widest)
     cover, assigned = np.zeros(n_detections, np.bool_), np.zeros(n_detections, np.bool_)
     matches = np.full(len(object_codes), -1)
-    outcomes = np.full(n_detections, NOT_JUDGED)
+    outcomes = np.full(n_detections, NOT_COUNTED)
     for f in range(len(object_starts) - 1):
         o0, o1, d0, d1 = object_starts[f], object_starts[f + 1], detection_starts[f], detection_starts[f + 1]
         _candidates(

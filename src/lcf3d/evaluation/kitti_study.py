@@ -1,149 +1,118 @@
-"""Everything that ``lcf3d eval`` says about one KITTI result set, gathered for metrics.json and the report."""
+"""A KITTI result set looked at closely, for metrics.json and the report."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
-from pathlib import Path
-from typing import Any
+from collections.abc import Callable, Mapping
+from functools import partial
 
 import numpy as np
 
 from lcf3d.evaluation.curves import precision_recall
-from lcf3d.evaluation.kitti import KittiEvaluator, KittiMetrics, Selection
-from lcf3d.evaluation.kitti_breakdown import IOU_THRESHOLDS, ComparisonRow, DistanceRow, ap_by_distance, ap_over_iou
-from lcf3d.evaluation.kitti_fates import Fates, FusionFates, fates, fusion_fates, read_provenance
-from lcf3d.evaluation.kitti_matching import FALSE_POSITIVE
+from lcf3d.evaluation.kitti import MEASURE_NAMES, KittiEvaluator, KittiMetrics, Selection
+from lcf3d.evaluation.kitti_breakdown import IOU_THRESHOLDS, ap_by_distance, ap_over_iou
+from lcf3d.evaluation.kitti_matching import BELOW, COUNTS, FALSE_POSITIVE, IGNORED, TRUE_POSITIVE
+from lcf3d.evaluation.kitti_outcomes import WorkingPoint, fusion_outcomes, working_point
+from lcf3d.evaluation.study import ClassStudy, ShownBox, Study
+from lcf3d.formats.kitti import KittiObjects
+from lcf3d.geometry.boxes import lidar_from_kitti
+from lcf3d.provenance import FusedDetections
 from lcf3d.structures import FloatArray, IntArray
 
 
-@dataclass(frozen=True, eq=False)
-class ClassStudy:
-    """One class at moderate difficulty, in 3D where the results have 3D boxes, else in the image.
-
-    Attributes:
-        selection: class, measure and difficulty.
-        ap_over_iou: AP (R40) at the IoU thresholds 0.1 to 0.9.
-        distance: AP by distance; empty for results without 3D boxes.
-        recall: (K,) of the unsampled curve.
-        precision: (K,) of the unsampled curve.
-        fates: at the score threshold of the best F1.
-        fusion: the fates split by what the fusion did, or None without provenance.
-    """
-
-    selection: Selection
-    ap_over_iou: list[float]
-    distance: list[DistanceRow]
-    recall: FloatArray
-    precision: FloatArray
-    fates: Fates
-    fusion: FusionFates | None
-
-
-@dataclass(frozen=True, eq=False)
-class KittiStudy:
-    """One result set, measured and looked at closely.
-
-    Attributes:
-        name: what to call it.
-        evaluator: ground truth and results.
-        metrics: the official curves.
-        classes: the closer look, for every class that the results cover.
-    """
-
-    name: str
-    evaluator: KittiEvaluator
-    metrics: KittiMetrics
-    classes: tuple[ClassStudy, ...]
-
-    def to_json(self) -> dict[str, Any]:
-        """Plain JSON values, without infinities."""
-        return {
-            "results": self.name,
-            "frames": self.metrics.frame_count,
-            "min_overlap": {name: dict(self.metrics.config.min_overlap[name]) for name in self.metrics.config.classes},
-            "metrics": self.metrics.to_json(),
-            "closer_look": {study.selection.class_name: _class_json(study) for study in self.classes},
-        }
-
-
-def study(evaluator: KittiEvaluator, name: str, results: Path | None = None, root: Path | None = None) -> KittiStudy:
-    """Measure a result set and look at it closely.
+def study(
+    evaluator: KittiEvaluator,
+    name: str,
+    metrics: KittiMetrics,
+    provenance: Mapping[str, FusedDetections],
+    camera_from_lidar: Callable[[str], FloatArray],
+) -> Study:
+    """Measure a result set and look at it closely: at moderate difficulty, in 3D where the results have 3D boxes.
 
     Args:
         evaluator: ground truth and results.
         name: what to call the result set.
-        results: folder of a fusion run; where it holds ``provenance``, fates are split by what the fusion did.
-        root: KITTI tree, for the calibration that dropped LiDAR boxes need.
+        metrics: the official curves.
+        provenance: by frame; with it, outcomes are split by what the fusion did.
+        camera_from_lidar: (4, 4) rectified reference camera from LiDAR, of a frame.
     """
-    provenance = read_provenance(results, evaluator.truth.frame_ids) if results is not None else {}
-    calibrations = _calibrations(root, list(provenance)) if root is not None and provenance else {}
-    classes = []
+    calibrations = {frame_id: camera_from_lidar(frame_id) for frame_id in provenance}
+    classes, points = [], []
     for class_name, measures in evaluator.covered.items():
         if not measures:
             continue
-        selection = Selection(class_name, "3d" if "3d" in measures else "bbox", "moderate")
-        recall, precision, _ = precision_recall(evaluator.events(selection))
-        in_3d = selection.measure == "3d"
+        in_3d = "3d" in measures
+        selection = Selection(class_name, "3d" if in_3d else "bbox", "moderate")
+        recall, precision, scores = precision_recall(evaluator.events(selection))
+        point = working_point(evaluator, selection)
+        points.append(point)
+        overlaps = ap_over_iou(evaluator, selection)
         classes.append(
             ClassStudy(
-                selection,
-                ap_over_iou(evaluator, selection),
+                class_name,
+                f"{MEASURE_NAMES[selection.measure]}, moderate",
+                "IoU",
+                dict(zip(IOU_THRESHOLDS, overlaps, strict=True)),
                 ap_by_distance(evaluator, selection) if in_3d else [],
                 recall,
                 precision,
-                fates(evaluator, selection),
-                fusion_fates(evaluator, provenance, calibrations, selection) if in_3d and calibrations else None,
+                scores,
+                point.threshold,
+                point.counts,
+                fusion_outcomes(evaluator, provenance, calibrations, selection) if in_3d and calibrations else None,
             )
         )
-    return KittiStudy(name, evaluator, evaluator.metrics(), tuple(classes))
+    wrong, missed = _errors(evaluator, points)
+    return Study(
+        name,
+        "KITTI",
+        evaluator.truth.frame_ids,
+        metrics.to_json(),
+        tuple(classes),
+        wrong,
+        missed,
+        partial(_boxes, evaluator, tuple(points), camera_from_lidar),
+    )
 
 
-def comparison_json(rows: Sequence[ComparisonRow]) -> list[dict[str, Any]]:
-    """Plain JSON values of a comparison."""
-    return [asdict(row) for row in rows]
-
-
-def worst_frames(study: KittiStudy, count: int) -> list[tuple[int, int, int]]:
-    """(frame index, false positives, misses) of the ``count`` frames with most errors over all classes, worst first."""
-    evaluator = study.evaluator
+def _errors(evaluator: KittiEvaluator, points: list[WorkingPoint]) -> tuple[IntArray, IntArray]:
+    """(F,) false positives and (F,) misses in each frame."""
     wrong = np.zeros(len(evaluator.truth), dtype=np.int64)
     missed = wrong.copy()
-    for part in study.classes:
-        wrong += _by_frame(evaluator.results.frame_of_object[part.fates.outcomes == FALSE_POSITIVE], len(wrong))
-        missed += _by_frame(evaluator.truth.frame_of_object[part.fates.missed], len(wrong))
-    order = np.argsort(-(wrong + missed), kind="stable")[:count]
-    return [(int(f), int(wrong[f]), int(missed[f])) for f in order if wrong[f] + missed[f]]
+    for point in points:
+        false = evaluator.results.frame_of_object[point.outcomes == FALSE_POSITIVE]
+        wrong += np.bincount(false, minlength=len(wrong))
+        missed += np.bincount(evaluator.truth.frame_of_object[point.missed], minlength=len(wrong))
+    return wrong, missed
 
 
-def _by_frame(frames: IntArray, n_frames: int) -> IntArray:
-    return np.bincount(frames, minlength=n_frames)
+def _boxes(
+    evaluator: KittiEvaluator,
+    points: tuple[WorkingPoint, ...],
+    camera_from_lidar: Callable[[str], FloatArray],
+    frame: int,
+) -> list[ShownBox]:
+    """What there is to draw of a frame."""
+    truth, results = evaluator.truth, evaluator.results
+    transform = camera_from_lidar(truth.frame_ids[frame])
+    shown = []
+    for point in points:
+        codes, _ = evaluator.codes(point.selection)
+        for row in range(*truth.starts[frame : frame + 2]):
+            outcome = {COUNTS: "missed" if point.missed[row] else "found", IGNORED: "ignored"}.get(int(codes[row]))
+            if outcome is not None:
+                shown.append(_shown(truth.objects, row, outcome, None, transform))
+        first, last = results.starts[frame : frame + 2]
+        for row in range(first, last):
+            verdict = int(point.outcomes[row])
+            if verdict == BELOW or results.objects.class_names[row].lower() != point.selection.class_name.lower():
+                continue
+            outcome = {TRUE_POSITIVE: "right", FALSE_POSITIVE: "wrong"}.get(verdict, "ignored")
+            shown.append(_shown(results.objects, row, outcome, int(row - first), transform))
+    return shown
 
 
-def _calibrations(root: Path, frame_ids: Sequence[str]) -> Mapping[str, FloatArray]:
-    from lcf3d.datasets.kitti import read_calibration
-
-    folder = Path(root) / "training" / "calib"
-    return {frame_id: read_calibration(folder / f"{frame_id}.txt").camera_from_lidar for frame_id in frame_ids}
-
-
-def _class_json(part: ClassStudy) -> dict[str, Any]:
-    return {
-        "measure": part.selection.measure,
-        "difficulty": part.selection.difficulty,
-        "ap_over_iou": {f"{iou:.1f}": ap for iou, ap in zip(IOU_THRESHOLDS, part.ap_over_iou, strict=True)},
-        "ap_by_distance": [
-            {
-                "near_m": row.near,
-                "far_m": row.far if np.isfinite(row.far) else None,
-                "AP_R40": row.ap,
-                "objects": row.objects,
-            }
-            for row in part.distance
-        ],
-        "best_f1": {
-            "score_threshold": part.fates.threshold if np.isfinite(part.fates.threshold) else None,
-            **part.fates.counts,
-        },
-        **({"fusion": part.fusion.to_json()} if part.fusion else {}),
-    }
+def _shown(objects: KittiObjects, row: int, outcome: str, output: int | None, transform: FloatArray) -> ShownBox:
+    one = objects[row : row + 1]
+    box = lidar_from_kitti(one.locations, one.dimensions, one.rotation_y, transform)[0] if one.has_box3d[0] else None
+    score = None if output is None or one.scores is None else float(one.scores[0])
+    return ShownBox(str(one.class_names[0]), outcome, score, box, one.boxes2d[0], output)

@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from html import escape
 
-from lcf3d.evaluation.kitti import DIFFICULTIES, MEASURE_NAMES
-from lcf3d.evaluation.kitti_breakdown import IOU_THRESHOLDS, ComparisonRow
-from lcf3d.evaluation.kitti_study import ClassStudy, KittiStudy
+from lcf3d.evaluation.protocol import ComparisonRow, TableData
+from lcf3d.evaluation.study import ClassStudy, Study
 from lcf3d.evaluation.svg import PALETTE, Line, line_chart
 
 _STYLE = """
@@ -24,12 +23,13 @@ th:first-child, td:first-child, td.text { text-align: left; }
   border: 2px solid; margin-right: .4em; }
 """
 
-_FATE_COLUMNS = ("matched", "recovered", "downweighted", "kept", "unknown")
+_OUTCOME_COLUMNS = ("matched", "recovered", "downweighted", "kept", "unknown")
 
 
 def html_report(
     title: str,
-    studies: Sequence[KittiStudy],
+    studies: Sequence[Study],
+    tables: Sequence[Sequence[TableData]],
     comparison: Sequence[ComparisonRow] = (),
     pictures: Mapping[str, str] | None = None,
 ) -> str:
@@ -38,18 +38,20 @@ def html_report(
     Args:
         title: heading.
         studies: one result set, or two to be shown side by side.
-        comparison: rows of `kitti_breakdown.compare`, for two.
+        tables: the official numbers of each.
+        comparison: rows of `lcf3d.evaluation.protocol.Evaluation.compare`, for two.
         pictures: HTML of each of the worst frames, by heading, of the last result set.
     """
     main = studies[-1]
     parts = [f"<h1>{escape(title)}</h1>", f"<p class='note'>{_introduction(studies)}</p>"]
-    parts += [part for study in studies for part in (_heading(study, studies), _ap_table(study))]
+    for study, own in zip(studies, tables, strict=True):
+        parts += [f"<h2>Average precision{_of(study, studies)}</h2>", *map(_official_table, own)]
     if comparison:
         parts += ["<h2>Side by side</h2>", _comparison_table(comparison, [study.name for study in studies])]
-    parts += ["<h2>AP over the IoU threshold, and precision over recall</h2>", _plots(studies)]
+    parts += ["<h2>AP over the matching threshold, and precision over recall</h2>", _plots(studies)]
     if any(part.distance for part in main.classes):
         parts += ["<h2>By distance</h2>", *(_distance_table(study, studies) for study in studies), _DISTANCE_NOTE]
-    parts += ["<h2>At the best F1</h2>", *(_fate_table(study, studies) for study in studies)]
+    parts += ["<h2>At the best F1</h2>", *(_outcome_table(study, studies) for study in studies)]
     fused = [study for study in studies if any(part.fusion for part in study.classes)]
     if fused:
         parts += ["<h2>What the fusion did</h2>", *(_fusion_tables(study, studies) for study in fused)]
@@ -65,14 +67,12 @@ def html_report(
     )
 
 
-_DISTANCE_NOTE = (
-    "<p class='note'>In brackets the number of objects; with fewer than 41 the official sampling cannot reach 100.</p>"
-)
-FATE_COLORS = {"right": "#2563eb", "wrong": "#dc2626", "missed": "#d97706", "found": "#16a34a", "ignored": "#94a3b8"}
+_DISTANCE_NOTE = "<p class='note'>In brackets the number of objects.</p>"
+OUTCOME_COLORS = {"right": "#2563eb", "wrong": "#dc2626", "missed": "#d97706", "found": "#16a34a", "ignored": "#94a3b8"}
 _KEY = (
     "<p class='key'>"
     + "".join(
-        f"<span><i style='border-color:{FATE_COLORS[name]};border-style:{style}'></i>{text}</span>"
+        f"<span><i style='border-color:{OUTCOME_COLORS[name]};border-style:{style}'></i>{text}</span>"
         for name, style, text in (
             ("found", "dashed", "object, found"),
             ("missed", "dashed", "object, missed"),
@@ -85,42 +85,22 @@ _KEY = (
 )
 
 
-def _introduction(studies: Sequence[KittiStudy]) -> str:
-    metrics = studies[0].metrics
-    names = metrics.config.classes
-    thresholds = ", ".join(f"{name} {metrics.config.min_overlap[name]['3d']:g}" for name in names)
+def _introduction(studies: Sequence[Study]) -> str:
+    measures = dict.fromkeys(part.measure for study in studies for part in study.classes)
     return (
-        f"KITTI protocol over {metrics.frame_count} frames; IoU thresholds in 3D: {escape(thresholds)}. "
-        "Average precision in percent over 40 recall positions (R40) unless said otherwise. The closer looks below are "
-        "at moderate difficulty, in 3D where the results have 3D boxes, else in the image."
+        f"{escape(studies[0].heading)} over {len(studies[0].frame_ids)} frames, average precision in percent. The "
+        f"closer looks below are measured as: {escape('; '.join(measures) or 'nothing')}."
     )
 
 
-def _of(study: KittiStudy, studies: Sequence[KittiStudy]) -> str:
+def _of(study: Study, studies: Sequence[Study]) -> str:
     return f" of {escape(study.name)}" if len(studies) > 1 else ""
 
 
-def _heading(study: KittiStudy, studies: Sequence[KittiStudy]) -> str:
-    return f"<h2>Average precision{_of(study, studies)}</h2>"
-
-
-def _ap_table(study: KittiStudy) -> str:
-    rows = []
-    for class_name in study.metrics.class_names:
-        for measure in study.metrics.measures(class_name):
-            values = [
-                f"{study.metrics.ap(class_name, measure, difficulty, sampling):.2f}"
-                for sampling in ("R40", "R11")
-                for difficulty in DIFFICULTIES
-            ]
-            rows.append([class_name, MEASURE_NAMES[measure], *values])
-    header = ["class", "measure", *DIFFICULTIES, *(f"{difficulty} (R11)" for difficulty in DIFFICULTIES)]
-    objects = "; ".join(
-        f"{name} " + " / ".join(str(study.metrics.curves[name, "bbox", d].object_count) for d in DIFFICULTIES)
-        for name in study.metrics.class_names
-        if (name, "bbox", "easy") in study.metrics.curves
-    )
-    return _table(header, rows) + f"<p class='note'>Objects that count, easy / moderate / hard: {escape(objects)}.</p>"
+def _official_table(table: TableData) -> str:
+    rows = [list(row) for row in table.rows if row is not None]
+    notes = "".join(f"<p class='note'>{escape(note)}</p>" for note in table.notes)
+    return f"<h3>{escape(table.title)}</h3>{_table([c.replace(chr(10), ' ') for c in table.columns], rows)}{notes}"
 
 
 def _comparison_table(rows: Sequence[ComparisonRow], names: Sequence[str]) -> str:
@@ -130,16 +110,16 @@ def _comparison_table(rows: Sequence[ComparisonRow], names: Sequence[str]) -> st
         style = ("good" if row.difference.value > 0 else "bad") if sure else "note"
         body.append(
             [
-                row.class_name,
-                MEASURE_NAMES[row.measure],
-                row.difficulty,
+                escape(row.class_name),
+                escape(row.measure),
+                escape(row.level),
                 f"{row.first.value:.2f}",
                 f"{row.second.value:.2f}",
                 f"<span class='{style}'>{row.difference.value:+.2f}</span>",
                 f"{row.difference.low:+.2f} to {row.difference.high:+.2f}",
             ]
         )
-    header = ["class", "measure", "difficulty", *map(escape, names), "difference", "95 % interval"]
+    header = ["class", "measure", "level", *map(escape, names), "difference", "95 % interval"]
     note = (
         "The interval is that of the difference when the frames are drawn again with replacement, the same draw for "
         "both; a difference is coloured where the interval leaves out zero."
@@ -147,20 +127,24 @@ def _comparison_table(rows: Sequence[ComparisonRow], names: Sequence[str]) -> st
     return _table(header, body, raw=True) + f"<p class='note'>{note}</p>"
 
 
-def _plots(studies: Sequence[KittiStudy]) -> str:
-    names = tuple(dict.fromkeys(part.selection.class_name for study in studies for part in study.classes))
+def _plots(studies: Sequence[Study]) -> str:
+    names = tuple(dict.fromkeys(part.class_name for study in studies for part in study.classes))
     colors = dict(zip(names, PALETTE, strict=False))
-    over_iou, curves = [], []
+    over, curves = [], []
     for index, study in enumerate(studies):
         for part in study.classes:
-            name = part.selection.class_name
+            name = part.class_name
             label = name if len(studies) == 1 else f"{name}, {study.name}"
             dashed = index < len(studies) - 1
-            over_iou.append(Line(label, IOU_THRESHOLDS, part.ap_over_iou, colors[name], dashed))
-            curves.append(Line(label, part.recall, part.precision, colors[name], dashed))
+            color, thresholds = colors.get(name, PALETTE[0]), list(part.ap_over_threshold)
+            over.append(Line(label, thresholds, list(part.ap_over_threshold.values()), color, dashed))
+            curves.append(Line(label, part.recall, part.precision, color, dashed))
+    kinds = dict.fromkeys(part.threshold_name for study in studies for part in study.classes)
+    kind = " and ".join(kinds) or "threshold"
+    reach = max((x for line in over for x in line.x), default=1.0)
     charts = {
-        "AP over the IoU threshold": line_chart(
-            over_iou, "IoU threshold", "AP (R40), %", (0, 1), (0, 100), width=500, markers=True
+        f"AP over the {kind}": line_chart(
+            over, kind, "AP, %", (0, max(1.0, float(reach))), (0, 100), width=500, markers=True
         ),
         "Precision over recall": line_chart(curves, "recall", "precision", (0, 1), (0, 1), width=500),
     }
@@ -168,37 +152,37 @@ def _plots(studies: Sequence[KittiStudy]) -> str:
     return f"<div class='plots'>{figures}</div>"
 
 
-def _distance_table(study: KittiStudy, studies: Sequence[KittiStudy]) -> str:
+def _distance_table(study: Study, studies: Sequence[Study]) -> str:
     parts = [part for part in study.classes if part.distance]
     if not parts:
         return ""
     ranges = [(row.near, row.far) for row in parts[0].distance]
     header = ["class" + _of(study, studies)]
     header += [f"{near:g} m and more" if far == float("inf") else f"{near:g} to {far:g} m" for near, far in ranges]
-    rows = [[part.selection.class_name, *(f"{row.ap:.2f} ({row.objects})" for row in part.distance)] for part in parts]
+    rows = [[escape(part.class_name), *(f"{row.ap:.2f} ({row.objects})" for row in part.distance)] for part in parts]
     return _table(header, rows, raw=True)
 
 
-def _fate_table(study: KittiStudy, studies: Sequence[KittiStudy]) -> str:
+def _outcome_table(study: Study, studies: Sequence[Study]) -> str:
     rows = []
     for part in study.classes:
-        counts = part.fates.counts
+        counts = part.counts
         hits, wrong, missed = counts.values()
         precision, recall = _ratio(hits, hits + wrong), _ratio(hits, hits + missed)
-        name = part.selection.class_name
-        rows.append([name, f"{part.fates.threshold:.3g}", *map(str, (hits, wrong, missed)), precision, recall])
+        name = escape(part.class_name)
+        rows.append([name, f"{part.score_threshold:.3g}", *map(str, (hits, wrong, missed)), precision, recall])
     header = ["class" + _of(study, studies), "score from", "right", "wrong", "missed", "precision", "recall"]
     return _table(header, rows, raw=True)
 
 
-def _fusion_tables(study: KittiStudy, studies: Sequence[KittiStudy]) -> str:
+def _fusion_tables(study: Study, studies: Sequence[Study]) -> str:
     parts = [part for part in study.classes if part.fusion]
     reported = [p.fusion.true_positives | p.fusion.false_positives for p in parts if p.fusion]
-    used = [column for column in _FATE_COLUMNS if any(column in counts for counts in reported)]
+    used = [column for column in _OUTCOME_COLUMNS if any(column in counts for counts in reported)]
     outputs = [row for part in parts for row in _output_rows(part, used)]
     dropped = [row for part in parts for row in _dropped_rows(part)]
     kinds = ("dropped", "below_threshold", "not_proposed")
-    misses = [[p.selection.class_name, *(str(p.fusion.misses[kind]) for kind in kinds)] for p in parts if p.fusion]
+    misses = [[p.class_name, *(str(p.fusion.misses[kind]) for kind in kinds)] for p in parts if p.fusion]
     note = (
         "At the scores of the table above. Dropped rightly: the dropped LiDAR detection fits no object, or one that is "
         "reported anyway. Dropped wrongly: it fits an object that is now missed."
@@ -220,8 +204,7 @@ def _output_rows(part: ClassStudy, used: Sequence[str]) -> list[list[str]]:
         return []
     groups = {"right": part.fusion.true_positives, "wrong": part.fusion.false_positives}
     return [
-        [part.selection.class_name, name, *(str(counts.get(column, 0)) for column in used)]
-        for name, counts in groups.items()
+        [part.class_name, name, *(str(counts.get(column, 0)) for column in used)] for name, counts in groups.items()
     ]
 
 
@@ -230,7 +213,7 @@ def _dropped_rows(part: ClassStudy) -> list[list[str]]:
         return []
     right, wrong = part.fusion.dropped_rightly, part.fusion.dropped_wrongly
     return [
-        [part.selection.class_name, reason.replace("_", " "), str(right.get(reason, 0)), str(wrong.get(reason, 0))]
+        [part.class_name, reason.replace("_", " "), str(right.get(reason, 0)), str(wrong.get(reason, 0))]
         for reason in sorted({*right, *wrong})
     ]
 

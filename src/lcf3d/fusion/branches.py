@@ -41,6 +41,23 @@ class Branches(NamedTuple):
     notes: tuple[str, ...]
 
 
+def by_camera_name(frame: Frame, camera: Mapping[str, Detections2D] | Detections2D) -> Mapping[str, Detections2D]:
+    """2D detections by camera name; those of a frame with one camera may come without it.
+
+    Raises:
+        ConfigError: detections without a name, of a frame with several cameras or none.
+    """
+    if not isinstance(camera, Detections2D):
+        return camera
+    names = [c.name for c in frame.cameras]
+    if len(names) != 1:
+        raise ConfigError(
+            f"frame {frame.id} has {len(names)} cameras: pass 2D detections by camera name, for example "
+            f"{{{names[0] if names else 'front'!r}: detections}}"
+        )
+    return {names[0]: camera}
+
+
 def prepare_branches(
     frame: Frame, lidar: Detections3D, camera: Mapping[str, Detections2D], config: FusionConfig
 ) -> Branches:

@@ -142,7 +142,7 @@ class Calibration(BaseModel):
         """The detections with probabilities as scores, where a map for their class is known."""
         return _with_probabilities(detections, self.camera)
 
-    def judges(self, class_name: str) -> bool:
+    def detects(self, class_name: str) -> bool:
         """Whether the camera branch detects a class at all."""
         return self.camera_classes is None or class_name in self.camera_classes
 

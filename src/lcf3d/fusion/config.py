@@ -1,4 +1,4 @@
-"""Settings of the fusion: one frozen model, flat YAML, three presets."""
+"""Settings of the fusion: one frozen model, flat YAML, and presets."""
 
 from __future__ import annotations
 
@@ -8,10 +8,12 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from typing_extensions import Self
 
 from lcf3d.errors import ConfigError
 from lcf3d.files import write_text
-from lcf3d.fusion.evidence import Evidence
+from lcf3d.fusion.evidence import ROLE_EVIDENCE, Evidence
+from lcf3d.fusion.roles import ROLES, role_of
 from lcf3d.structures import KITTI_CLASSES, NUSCENES_CLASSES, FloatArray
 
 Fraction = Annotated[float, Field(ge=0, le=1)]
@@ -20,56 +22,66 @@ Fraction = Annotated[float, Field(ge=0, le=1)]
 class FusionConfig(BaseModel):
     """All settings of `LateCascadeFusion`; see docs/configuration.md for what each does.
 
-    The defaults are METHOD's for KITTI-like data with one camera. Thresholds are exclusive: a score or IoU must be
-    higher.
+    The defaults are what ``lcf3d run`` uses: the camera adds evidence and takes it away, and deletes nothing. They hold
+    for any class names, see `lcf3d.fusion.roles`. Thresholds are exclusive: a score or IoU must be higher.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     class_names: tuple[str, ...] = Field(default=KITTI_CLASSES, min_length=1, description="classes to detect")
-    camera_score_threshold: Fraction = Field(default=0.5, description="2D detections not above it are left out")
+    camera_score_threshold: Fraction = Field(default=0.1, description="2D detections not above it are left out")
     decisive_score: Fraction = Field(
-        default=0.0, description="2D detections not above it only support boxes of their class: no label, no recovery"
+        default=0.5, description="2D detections not above it only support boxes of their class: no label, no recovery"
     )
-    lidar_score_threshold: Fraction = Field(default=0.1, description="3D detections not above it are left out")
+    lidar_score_threshold: Fraction = Field(default=0.0, description="3D detections not above it are left out")
     max_boxes: int = Field(default=1000, ge=1, description="only so many 3D boxes of highest score a frame take part")
 
     clustering: Literal["cliques", "components", "nms"] = Field(
-        default="cliques", description="how 3D boxes are grouped"
+        default="cliques", description="how 3D boxes are grouped: cliques, components or nms"
     )
     cluster_iou: Fraction = Field(default=0.3, description="tau_z: BEV IoU that links two boxes")
-    class_aware: bool = Field(default=False, description="link boxes of equal class only")
-
+    class_aware: bool = Field(default=True, description="link boxes of equal class only")
     assignment: Literal["gated", "paper", "class_first"] = Field(
-        default="gated", description="drop poor pairs before assigning, after it (paper), or pair equal classes first"
+        default="class_first",
+        description="gated: drop poor pairs before assigning; paper: after it; class_first: pair equal classes first",
     )
     match_iou: Fraction = Field(default=0.4, description="tau_b: image IoU of a match")
     representative: Literal["highest_score", "camera_class"] = Field(
-        default="highest_score", description="which member stands for a matched cluster"
+        default="highest_score",
+        description="member that stands for a matched cluster: highest_score, or of the camera_class first",
     )
-    unmatched: Literal["drop", "downweight", "keep"] = Field(
-        default="drop", description="clusters in view that no camera confirms"
+    elsewhere_iou: Fraction = Field(
+        default=0.3, description="image IoU with a box confirmed in another camera that shows the same object"
     )
-    miss_likelihood: Fraction = Field(
-        default=0.2, description="downweight: the score a camera silently gives what it does not detect"
-    )
-    out_of_view: Literal["keep", "drop"] = Field(default="keep", description="clusters that no used camera looks at")
 
     recovery: bool = Field(default=True, description="lift unmatched 2D detections into frustums")
     enlargement: Annotated[float, Field(ge=0)] = Field(default=0.05, description="e: growth of 2D boxes before lifting")
     min_points: int = Field(default=10, ge=1, description="p_min: fewest points of a frustum")
-    mask_mode: Literal["box", "mask", "box+mask"] = Field(default="box", description="how instance masks are used")
+    mask_mode: Literal["box", "mask", "box+mask"] = Field(
+        default="box", description="points of a frustum: all in the box, those in the mask, or both told apart"
+    )
     confirm_iou: Fraction = Field(default=0.3, description="tau_d: image IoU that confirms a recovered box")
     min_quality: Fraction = Field(default=0.3, description="least quality of the localizer's fit that is confirmed")
     duplicate_iou: Fraction = Field(
         default=0.1, description="BEV IoU with a confirmed box that makes a recovered one a double"
     )
 
+    unmatched: Literal["drop", "downweight", "keep"] = Field(
+        default="downweight", description="clusters in view that no camera confirms: drop, downweight or keep"
+    )
+    miss_likelihood: Fraction = Field(
+        default=0.2, description="downweight: the score a camera silently gives what it does not detect"
+    )
+    out_of_view: Literal["keep", "drop"] = Field(
+        default="keep", description="clusters that no used camera looks at: keep or drop"
+    )
     ensemble: Literal["probabilistic", "product", "evidence", "none"] = Field(
-        default="probabilistic", description="how scores are fused; none keeps the LiDAR branch's score and class"
+        default="evidence",
+        description="how scores are fused: evidence, probabilistic, product (the paper's), or none",
     )
     evidence: dict[str, Evidence] = Field(
-        default_factory=dict, description="ensemble evidence: weights by class, where no calibration gives them"
+        default_factory=lambda: dict(ROLE_EVIDENCE),
+        description="ensemble evidence: weights by class, or by role for classes that are not named",
     )
     relabel_score: Fraction = Field(
         default=0.0, description="where labels differ, a 2D detection above it gives label and score (Algorithm 1: all)"
@@ -82,35 +94,60 @@ class FusionConfig(BaseModel):
     def _check_names(self) -> FusionConfig:
         if len(set(self.class_names)) != len(self.class_names):
             raise ValueError("class_names must differ from each other")
-        for setting in ("priors", "evidence"):
-            unknown = sorted(set(getattr(self, setting)) - set(self.class_names))
+        for setting, others in (("priors", ()), ("evidence", ROLES)):
+            unknown = sorted(set(getattr(self, setting)) - {*self.class_names, *others})
             if unknown:
                 raise ValueError(f"{setting} names {unknown}, which are not in class_names")
+        for name, condition in self.without_effect().items():
+            if getattr(self, name) != type(self).model_fields[name].get_default(call_default_factory=True):
+                raise ValueError(f"{name} has no effect here, it is used with {condition}; leave it out")
         return self
 
+    def without_effect(self) -> dict[str, str]:
+        """Settings that change nothing under the others, with what they are used with."""
+        idle = {}
+        if self.ensemble != "evidence":
+            idle["evidence"] = "ensemble: evidence"
+        if self.ensemble not in ("probabilistic", "product"):
+            idle["priors"] = "ensemble: probabilistic or product"
+        if self.ensemble == "none":
+            idle["relabel_score"] = "an ensemble other than none"
+        if self.unmatched != "downweight" or self.ensemble == "evidence":
+            idle["miss_likelihood"] = "unmatched: downweight and an ensemble other than evidence"
+        if self.class_aware:
+            idle["representative"] = "class_aware: false"
+        if not self.recovery:
+            own = ("enlargement", "min_points", "mask_mode", "confirm_iou", "min_quality", "duplicate_iou")
+            idle.update(dict.fromkeys(own, "recovery: true"))
+        return idle
+
     @classmethod
-    def preset(cls, name: str) -> FusionConfig:
-        """The settings of that name: ``paper``, ``kitti`` or ``nuscenes``.
+    def preset(cls, name: str, **changes: Any) -> Self:
+        """The settings of that name: ``default``, ``paper``, ``kitti`` or ``nuscenes``.
+
+        Args:
+            name: of the preset.
+            changes: settings that differ, for example ``class_names=("car", "person")``.
 
         Raises:
-            ConfigError: there is no such preset.
+            ConfigError: there is no such preset, or a change makes no sense.
         """
         if name not in PRESETS:
             raise ConfigError(f"there is no preset {name!r}; choose one of {', '.join(PRESETS)}")
-        return cls(**PRESETS[name])
+        return cls.of({**PRESETS[name], **changes}, source=f"preset {name}")
 
     @classmethod
-    def load(cls, name_or_path: str) -> FusionConfig:
+    def load(cls, name_or_path: str | Path) -> Self:
         """A preset by name, or the settings of a YAML file (what it leaves out keeps its default).
 
         Raises:
             ConfigError: neither, or a value that makes no sense; names the setting.
         """
         if name_or_path in PRESETS:
-            return cls.preset(name_or_path)
-        path = Path(name_or_path)
+            return cls.preset(str(name_or_path))
+        path = Path(name_or_path).expanduser()
         if not path.is_file():
-            raise ConfigError(f"{name_or_path!r} is neither a preset ({', '.join(PRESETS)}) nor a file")
+            raise ConfigError(f"{str(name_or_path)!r} is neither a preset ({', '.join(PRESETS)}) nor a file")
         try:
             values = yaml.safe_load(path.read_text(encoding="utf-8"))
         except yaml.YAMLError as error:
@@ -120,7 +157,7 @@ class FusionConfig(BaseModel):
         return cls.of(values, source=str(path))
 
     @classmethod
-    def of(cls, values: dict[str, Any], source: str = "settings") -> FusionConfig:
+    def of(cls, values: dict[str, Any], source: str = "settings") -> Self:
         """Settings from plain values.
 
         Raises:
@@ -131,24 +168,42 @@ class FusionConfig(BaseModel):
         except ValidationError as error:
             first = error.errors()[0]
             name = ".".join(str(part) for part in first["loc"])
-            raise ConfigError(f"{source}: {name + ': ' if name else ''}{first['msg']}") from None
+            message = first["msg"].removeprefix("Value error, ")
+            raise ConfigError(f"{source}: {name + ': ' if name else ''}{message}") from None
 
-    def updated(self, **changes: Any) -> FusionConfig:
-        """The same settings but for ``changes``, validated."""
-        return self.of({**self.model_dump(), **changes})
+    def updated(self, **changes: Any) -> Self:
+        """The same settings but for ``changes``, validated; those that lose their effect go back to their default.
+
+        Raises:
+            ConfigError: an unknown name, a value that makes no sense, or a change that would have no effect.
+        """
+        values = {name: getattr(self, name) for name in type(self).model_fields}
+        values.update(changes)
+        try:
+            idle = type(self).model_construct(**values).without_effect()
+        except (TypeError, AttributeError):
+            idle = {}
+        return self.of({name: value for name, value in values.items() if name in changes or name not in idle})
 
     def dump(self, path: Path) -> None:
         """Write all settings as YAML, whole or not at all."""
         write_text(path, self.to_yaml())
 
     def to_yaml(self) -> str:
-        """All settings as flat YAML, a comment on each."""
+        """All settings as flat YAML under the headings of their stages, a comment on each."""
         values = self.model_dump(mode="json")
-        lines = []
+        lines: list[str] = []
         for name, field in type(self).model_fields.items():
+            if name in STAGES:
+                lines.append(f"{'' if not lines else chr(10)}# {STAGES[name]}")
             text = yaml.safe_dump({name: values[name]}, default_flow_style=True, width=1000).strip()[1:-1]
             lines.append(f"{text}  # {field.description}")
         return "\n".join(lines) + "\n"
+
+    def evidence_of(self, class_name: str) -> Evidence:
+        """The weights of a class: its own, else those of its role."""
+        role = role_of(class_name)
+        return self.evidence.get(class_name) or self.evidence.get(role) or ROLE_EVIDENCE[role]
 
     def prior_array(self) -> FloatArray:
         """(L,) prior of every class: the given one, else 1 / L (product) or 1 / 2 (class or not, probabilistic)."""
@@ -156,56 +211,37 @@ class FusionConfig(BaseModel):
         return np.array([self.priors.get(name, uniform) for name in self.class_names])
 
 
-_PAPER: dict[str, Any] = {
-    "assignment": "paper",
-    "unmatched": "drop",
-    "out_of_view": "drop",
-    "ensemble": "product",
-    "min_quality": 0.0,
+STAGES = {
+    "class_names": "what takes part",
+    "clustering": "bounding box matching (section 4.1.3)",
+    "recovery": "detection recovery (section 4.1.4)",
+    "unmatched": "semantic fusion (section 4.1.5) and what nothing confirms",
+    "pairs": "stereo pairs (section 4.2)",
 }
-# measured: docs/when-fusion-helps.md
-_CAR = Evidence().model_dump()
-_PERSON = {
-    "base": -1.0,
-    "trust": 1.0,
-    "support": (2.5, 4.5, 6.0, 6.0),
-    "miss": 0.3,
-    "off_ground": 0.0,
-    "rival": 3.0,
-    "recovered": 0.7,
-}
+"""Headings of the settings: first setting of a stage -> what the stage is called."""
+
 PRESETS: dict[str, dict[str, Any]] = {
-    "paper": _PAPER,
-    "kitti": {
-        "camera_score_threshold": 0.1,
-        "decisive_score": 0.5,
-        "lidar_score_threshold": 0.0,
-        "class_aware": True,
-        "assignment": "class_first",
-        "unmatched": "downweight",
+    "default": {},
+    # the paper's own values for KITTI: METHOD's table
+    "paper": {
+        "camera_score_threshold": 0.5,
+        "decisive_score": 0.0,
+        "lidar_score_threshold": 0.1,
+        "class_aware": False,
+        "assignment": "paper",
+        "unmatched": "drop",
         "out_of_view": "drop",
-        "ensemble": "evidence",
-        "evidence": {
-            "Car": _CAR,
-            "Pedestrian": _PERSON,
-            # as for pedestrians but for the rival, which cost cyclists more than it brought
-            "Cyclist": {**_PERSON, "rival": 0.0},
-        },
+        "ensemble": "product",
+        "min_quality": 0.0,
     },
+    # measured: docs/when-fusion-helps.md. KITTI labels only what the front cameras see
+    "kitti": {"out_of_view": "drop"},
     # measured with simulated camera detections only: docs/six-cameras.md
     "nuscenes": {
         "class_names": NUSCENES_CLASSES,
-        "camera_score_threshold": 0.1,
         "decisive_score": 0.2,
         "lidar_score_threshold": 0.05,
-        "class_aware": True,
-        "assignment": "class_first",
-        "match_iou": 0.4,
         "enlargement": 0.0,
-        "unmatched": "downweight",
-        "out_of_view": "keep",
-        "ensemble": "evidence",
-        "evidence": {name: {**_PERSON, "rival": 0.0} for name in NUSCENES_CLASSES},
         "relabel_score": 0.8,
     },
 }

@@ -4,7 +4,7 @@ The paper's ensemble multiplies scores as if detectors were calibrated and indep
 camera misses. Measured on real detectors this helps where the LiDAR branch is poor and hurts where it is good
 (docs/when-fusion-helps.md). Here the log-odds of a LiDAR box are
 
-    base + trust * logit(s3d) + s2d * support(IoU) - miss * exposure - off_ground * slope - rival * p_rival
+    base + trust * logit(s3d) + s2d * support(IoU) - miss * exposure - off_ground * slope - competing * p_other
 
 where ``s2d`` and the image IoU are those of the matched 2D detection (zero without one). No weight is negative and
 ``support`` does not fall, so that more camera support never lowers a score.
@@ -13,7 +13,7 @@ where ``s2d`` and the image IoU are those of the matched 2D detection (zero with
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
@@ -44,7 +44,7 @@ class Evidence(BaseModel):
         recovered: probability that a box recovered from a certain 2D detection, with image IoU 1, is right; recovered
             scores are multiplied with it. Not fitted: it takes scans. Without it a recovered box, which the LiDAR
             detector has missed, would rank above most confirmed ones.
-        rival: log-odds lost to a certain (score 1) LiDAR box of another class, of higher score, in the same cluster.
+        competing: log-odds lost to a certain (score 1) LiDAR box of another class, of higher score, in its cluster.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -54,8 +54,16 @@ class Evidence(BaseModel):
     support: tuple[Weight, Weight, Weight, Weight] = (0.1, 0.5, 1.3, 3.0)
     miss: Weight = 0.1
     off_ground: Weight = 2.0
-    rival: Weight = 0.0
+    competing: Weight = 0.0
     recovered: Annotated[float, Field(ge=0, le=1)] = 0.4
+
+    @model_validator(mode="before")
+    @classmethod
+    def _read_old_name(cls, values: Any) -> Any:
+        """Files of lcf3d 0.1 call ``competing`` by the name ``rival``."""
+        if isinstance(values, dict) and "rival" in values and "competing" not in values:
+            values = {("competing" if name == "rival" else name): value for name, value in values.items()}
+        return values
 
     @model_validator(mode="after")
     def _check_support(self) -> Evidence:
@@ -66,12 +74,12 @@ class Evidence(BaseModel):
     @classmethod
     def lidar_alone(cls) -> Evidence:
         """The LiDAR score as it is."""
-        return cls(base=0, trust=1, support=(0, 0, 0, 0), miss=0, off_ground=0, rival=0)
+        return cls(base=0, trust=1, support=(0, 0, 0, 0), miss=0, off_ground=0, competing=0)
 
     @classmethod
     def from_weights(cls, weights: FloatArray, recovered: float = 0.4) -> Evidence:
         """The inverse of `weights`; ``recovered`` is not among them."""
-        trust, rival, off_ground, miss, *steps, base = (float(w) for w in weights)
+        trust, competing, off_ground, miss, *steps, base = (float(w) for w in weights)
         support = np.cumsum(steps)
         return cls(
             base=base,
@@ -79,7 +87,7 @@ class Evidence(BaseModel):
             support=(float(support[0]), float(support[1]), float(support[2]), float(support[3])),
             miss=miss,
             off_ground=off_ground,
-            rival=rival,
+            competing=competing,
             recovered=recovered,
         )
 
@@ -92,12 +100,23 @@ class Evidence(BaseModel):
     def weights(self) -> FloatArray:
         """(9,) weights of the columns of `evidence_table`; all but the last, the constant, must not be negative."""
         steps = np.diff((0.0, *self.support))
-        return np.array([self.trust, self.rival, self.off_ground, self.miss, *steps, self.base])
+        return np.array([self.trust, self.competing, self.off_ground, self.miss, *steps, self.base])
+
+
+_PERSON = Evidence(base=-1.0, trust=1.0, support=(2.5, 4.5, 6.0, 6.0), miss=0.3, off_ground=0.0, recovered=0.7)
+ROLE_EVIDENCE: dict[str, Evidence] = {
+    "vehicle": Evidence(),
+    "pedestrian": _PERSON.model_copy(update={"competing": 3.0}),
+    # as for pedestrians but for the competing class, which cost cyclists more than it brought
+    "rider": _PERSON,
+    "other": _PERSON,
+}
+"""Weights by role (`lcf3d.fusion.roles`), measured on real detectors: docs/when-fusion-helps.md."""
 
 
 def evidence_table(
     log_odds: FloatArray,
-    rival: FloatArray,
+    competing: FloatArray,
     slope: FloatArray,
     exposure: FloatArray,
     camera_scores: FloatArray,
@@ -107,7 +126,7 @@ def evidence_table(
 
     Args:
         log_odds: (N,) of the LiDAR scores.
-        rival: (N,) score of the best LiDAR box of another class in the same cluster, 0 where that is not higher.
+        competing: (N,) score of the best LiDAR box of another class in the same cluster, 0 where that is not higher.
         slope: (N,) see `ground_slope`.
         exposure: (N,) see `miss_exposure`; used where no 2D detection is matched.
         camera_scores: (N,) score of the matched 2D detection, 0 without one.
@@ -116,7 +135,7 @@ def evidence_table(
     bounds = (0.0, *SUPPORT_IOU)
     steps = [np.clip((iou - low) / (high - low), 0, 1) for low, high in pairwise(bounds)]
     unmatched = np.where(iou > 0, 0.0, exposure)
-    columns = [log_odds, -rival, -slope, -unmatched, *(camera_scores * s for s in steps), np.ones(len(iou))]
+    columns = [log_odds, -competing, -slope, -unmatched, *(camera_scores * s for s in steps), np.ones(len(iou))]
     table: FloatArray = np.stack(columns, axis=1)
     return table
 

@@ -2,29 +2,34 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from lcf3d import plugins
-from lcf3d.fusion.branches import Branches, prepare_branches
+from lcf3d.fusion.branches import Branches, by_camera_name, prepare_branches
 from lcf3d.fusion.calibration import Calibration
+from lcf3d.fusion.cluster_evidence import ClusterEvidence, fused_scores, gather_evidence, recovered_trust
 from lcf3d.fusion.clustering import Clusters, cluster_boxes
 from lcf3d.fusion.config import FusionConfig
-from lcf3d.fusion.localizer import Localizer
-from lcf3d.fusion.matching import Matches, View, confirmed_elsewhere, match_view, merge_views
-from lcf3d.fusion.outcome import (
-    ClusterOutcome,
+from lcf3d.fusion.decisions import (
+    ClusterDecisions,
     assemble,
     choose_representatives,
     decide_clusters,
     replace_unconfirmed,
 )
+from lcf3d.fusion.localizer import Localizer
+from lcf3d.fusion.matching import Matches, View, confirmed_elsewhere, match_view, merge_views
 from lcf3d.fusion.recovery import Recovery, recover
-from lcf3d.fusion.weighing import Weighed, fused_scores, recovered_trust, weigh_clusters
-from lcf3d.provenance import FusedDetections, Reason, Stage
+from lcf3d.fusion.roles import unknown_classes
+from lcf3d.fusion.warm_up import warm_up_frame
+from lcf3d.provenance import FusedDetections, Outcome, Reason
 from lcf3d.structures import BoolArray, Detections2D, Detections3D, FloatArray, Frame, IntArray
+
+log = logging.getLogger(__name__)
 
 
 class LateCascadeFusion:
@@ -49,30 +54,41 @@ class LateCascadeFusion:
         calibration: Calibration | None = None,
     ) -> None:
         self.config = config or FusionConfig()
+        unknown = unknown_classes(self.config.class_names)
+        if unknown and self.config.ensemble == "evidence":
+            log.warning("classes %s are unknown, treated as 'other'; give them weights with evidence", unknown)
         self.calibration = calibration or Calibration()
         self.localizer: Localizer = localizer or plugins.load("lcf3d.localizers", "geometric")()
 
-    def __call__(self, frame: Frame, lidar: Detections3D, camera: Mapping[str, Detections2D]) -> FusedDetections:
+    def warm_up(self) -> None:
+        """Compile and load everything that the first frame would wait for, on a made-up frame."""
+        frame, lidar, camera = warm_up_frame(self.config.class_names)
+        self(frame, lidar, camera)
+
+    def __call__(
+        self, frame: Frame, lidar: Detections3D, camera: Mapping[str, Detections2D] | Detections2D
+    ) -> FusedDetections:
         """Fuse the detections of one frame.
 
         Args:
             frame: cameras and, for recovery, the scan.
             lidar: 3D detections in the LiDAR frame, best without non-maximum suppression.
             camera: 2D detections by camera name; a camera that is left out was not looked through, which is not the
-                same as one without detections.
+                same as one without detections. Those of a frame with a single camera may come without its name.
 
         Raises:
             ConfigError: scores outside [0, 1], an unknown camera, or class lists that share no name.
         """
+        camera = by_camera_name(frame, camera)
         branches = self._prepare(frame, lidar, camera)  # figure 2 (a), (b)
         clusters, views, matches = self._match(branches)  # (c) bounding box matching
-        outcome = self._decide(branches, clusters, views, matches)  # (e) semantic fusion
-        recovery, notes = self._recover(frame, branches, clusters, views, matches, outcome)  # (d) detection recovery
-        outcome = replace_unconfirmed(outcome, branches.lidar, recovery, self.config.duplicate_iou)
-        fused = assemble(branches, clusters, views, matches, outcome, recovery, notes)
+        decisions = self._decide(branches, clusters, views, matches)  # (e) semantic fusion
+        recovery, notes = self._recover(frame, branches, clusters, views, matches, decisions)  # (d) detection recovery
+        decisions = replace_unconfirmed(decisions, branches.lidar, recovery, self.config.duplicate_iou)
+        fused = assemble(branches, clusters, views, matches, decisions, recovery, notes)
         return replace(fused, lidar_inputs=lidar, camera_inputs=tuple(camera[name] for name in fused.camera_names))
 
-    def weigh(self, frame: Frame, lidar: Detections3D, camera: Mapping[str, Detections2D]) -> Weighed:
+    def evidence(self, frame: Frame, lidar: Detections3D, camera: Mapping[str, Detections2D]) -> ClusterEvidence:
         """The evidence for every cluster of one frame, ``box`` counted in ``lidar``: what calibration is fitted on.
 
         Clusters that no camera looks at, that none judges, or that are matched with another class have their ``agreed``
@@ -81,8 +97,8 @@ class LateCascadeFusion:
         branches = self._prepare(frame, lidar, camera)
         clusters, views, matches = self._match(branches)
         box = choose_representatives(branches, clusters, matches, self.config)
-        weighed = weigh_clusters(box, branches, views, matches, self.config, self.calibration)
-        used = weighed.agreed & matches.visible & self._judged(branches, box)
+        weighed = gather_evidence(box, branches, views, matches, self.config, self.calibration)
+        used = weighed.agreed & matches.visible & self._detectable(branches, box)
         return weighed._replace(box=branches.lidar_index[box], agreed=used)
 
     def _prepare(self, frame: Frame, lidar: Detections3D, camera: Mapping[str, Detections2D]) -> Branches:
@@ -90,21 +106,21 @@ class LateCascadeFusion:
         probable = {name: self.calibration.calibrate_camera(found) for name, found in camera.items()}
         return prepare_branches(frame, self.calibration.calibrate_lidar(lidar), probable, self.config)
 
-    def _judged(self, branches: Branches, boxes: IntArray) -> BoolArray:
+    def _detectable(self, branches: Branches, boxes: IntArray) -> BoolArray:
         """Which of some LiDAR boxes are of a class that the camera branch detects at all."""
-        known = np.array([self.calibration.judges(name) for name in self.config.class_names])
+        known = np.array([self.calibration.detects(name) for name in self.config.class_names])
         return np.asarray(known[branches.lidar.labels[boxes]], dtype=bool)
 
     def _decide(
         self, branches: Branches, clusters: Clusters, views: Sequence[View], matches: Matches
-    ) -> ClusterOutcome:
+    ) -> ClusterDecisions:
         """Semantic fusion (section 4.1.5) of matched clusters, the chosen policy for the others."""
         box = choose_representatives(branches, clusters, matches, self.config)
         scores = None
         if self.config.ensemble == "evidence":
-            weighed = weigh_clusters(box, branches, views, matches, self.config, self.calibration)
+            weighed = gather_evidence(box, branches, views, matches, self.config, self.calibration)
             scores = fused_scores(weighed, self.config, self.calibration)
-        return decide_clusters(box, branches, matches, self.config, self._judged(branches, box), scores)
+        return decide_clusters(box, branches, matches, self.config, self._detectable(branches, box), scores)
 
     def _match(self, branches: Branches) -> tuple[Clusters, list[View], Matches]:
         """Bounding box matching (section 4.1.3): cluster once, match per camera, merge."""
@@ -138,7 +154,7 @@ class LateCascadeFusion:
         class go first; of the others only decisive detections, which may change a label.
         """
         boxes = clusters.representative
-        judged = np.broadcast_to(self._judged(branches, boxes)[:, None], (len(boxes), len(found)))
+        judged = np.broadcast_to(self._detectable(branches, boxes)[:, None], (len(boxes), len(found)))
         if self.config.assignment != "class_first":
             return [] if judged.all() else [judged]
         equal = branches.lidar.labels[boxes][:, None] == found.labels[None]
@@ -152,14 +168,14 @@ class LateCascadeFusion:
         clusters: Clusters,
         views: Sequence[View],
         matches: Matches,
-        outcome: ClusterOutcome,
+        decisions: ClusterDecisions,
     ) -> tuple[Recovery, list[str]]:
         """Detection recovery (section 4.1.4) of the 2D detections that nothing matched."""
         config = self.config
         candidates = []
         for c, (view, found) in enumerate(zip(views, branches.camera, strict=True)):
             free = np.setdiff1d(np.arange(len(found)), view.match)
-            elsewhere = confirmed_elsewhere(views, matches, clusters, found.boxes[free], c, config.confirm_iou)
+            elsewhere = confirmed_elsewhere(views, matches, clusters, found.boxes[free], c, config.elsewhere_iou)
             self._mark(branches, c, free[elsewhere], Reason.SEEN_ELSEWHERE)
             candidates.append(free[~elsewhere])
         notes: list[str] = []
@@ -186,7 +202,7 @@ class LateCascadeFusion:
             branches.cameras,
             branches.camera,
             candidates,
-            self._confirmed(branches, outcome),
+            self._confirmed(branches, decisions),
             self.localizer,
             enlargement=config.enlargement,
             min_points=config.min_points,
@@ -210,12 +226,12 @@ class LateCascadeFusion:
         trust = recovered_trust(self.config, self.calibration)
         return recovery._replace(scores=recovery.scores * trust[recovery.labels])
 
-    def _confirmed(self, branches: Branches, outcome: ClusterOutcome) -> FloatArray:
+    def _confirmed(self, branches: Branches, decisions: ClusterDecisions) -> FloatArray:
         """Boxes that a recovered one may not double: matched ones, and those kept where no camera looks."""
-        lasting = (outcome.stage == Stage.MATCHED) | (
-            (outcome.stage == Stage.KEPT) & (outcome.reason == Reason.OUT_OF_VIEW)
+        lasting = (decisions.outcome == Outcome.MATCHED) | (
+            (decisions.outcome == Outcome.KEPT) & (decisions.reason == Reason.OUT_OF_VIEW)
         )
-        boxes: FloatArray = branches.lidar.boxes[outcome.box[lasting]]
+        boxes: FloatArray = branches.lidar.boxes[decisions.box[lasting]]
         return boxes
 
     @staticmethod

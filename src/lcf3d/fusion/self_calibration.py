@@ -6,11 +6,12 @@ branch detects and where the ground is; the evidence weights stay those of the s
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
 import numpy as np
 
+from lcf3d.fusion.branches import by_camera_name
 from lcf3d.fusion.calibration import (
     Calibration,
     ScoreMap,
@@ -38,7 +39,7 @@ BEST_SHARE = 0.02
 # before any box is seen the camera is taken to confirm 0.95 of this many
 RECALL_PRIOR = 20.0
 
-FrameDetections = tuple[Frame, Detections3D, Detections2D]
+FrameDetections = tuple[Frame, Detections3D, Mapping[str, Detections2D] | Detections2D]
 
 
 class _Observed(NamedTuple):
@@ -63,7 +64,7 @@ def self_calibrate(frames: Iterable[FrameDetections], config: FusionConfig) -> C
     of the log-odds that a miss is worth, ``log(1 - recall)``, to the same at ``FULL_RECALL``.
 
     Args:
-        frames: each frame with its LiDAR detections and those of its first camera.
+        frames: each frame with its LiDAR detections and the 2D detections of the cameras that were looked through.
         config: settings.
 
     Returns:
@@ -72,8 +73,9 @@ def self_calibrate(frames: Iterable[FrameDetections], config: FusionConfig) -> C
     """
     parts, camera_labels = [], np.zeros(len(config.class_names), dtype=bool)
     for frame, lidar, camera in frames:
-        found = camera.with_classes(config.class_names)
-        camera_labels[found.labels] = True
+        found = {name: d.with_classes(config.class_names) for name, d in by_camera_name(frame, camera).items()}
+        for detections in found.values():
+            camera_labels[detections.labels] = True
         parts.append(_observe(frame, lidar.with_classes(config.class_names), found, config))
     if not parts:
         return Calibration(source=_SOURCE)
@@ -86,7 +88,7 @@ def self_calibrate(frames: Iterable[FrameDetections], config: FusionConfig) -> C
         taught = seen.visible[own] & camera_labels[label]
         share = camera_share(seen.scores[own][taught], seen.confirmed[own][taught])
         if share < 1:
-            evidence[name] = config.evidence.get(name, Evidence()).with_camera_share(share)
+            evidence[name] = config.evidence_of(name).with_camera_share(share)
         if not own.any() or natural_transform(seen.scores[own]) == "logit":
             continue
         maps[name] = _taught_map(seen.scores[own], seen.confirmed[own], taught)
@@ -103,15 +105,18 @@ def self_calibrate(frames: Iterable[FrameDetections], config: FusionConfig) -> C
 _SOURCE = "the frames of a run, without labels, with the camera as teacher"
 
 
-def _observe(frame: Frame, lidar: Detections3D, camera: Detections2D, config: FusionConfig) -> _Observed:
+def _observe(frame: Frame, lidar: Detections3D, found: Mapping[str, Detections2D], config: FusionConfig) -> _Observed:
     """The boxes of one frame."""
     confirmed, visible = np.zeros(len(lidar), dtype=bool), np.zeros(len(lidar), dtype=bool)
-    if frame.cameras and len(lidar):
-        projected, visible = project_boxes(lidar.boxes, frame.cameras[0])
-        teachers = camera[camera.scores > TEACHER_SCORE]
+    for camera in frame.cameras if len(lidar) else ():
+        if camera.name not in found:
+            continue
+        projected, seen = project_boxes(lidar.boxes, camera)
+        teachers = found[camera.name][found[camera.name].scores > TEACHER_SCORE]
         overlap = image_iou(projected, teachers.boxes)
         overlap[lidar.labels[:, None] != teachers.labels[None]] = 0
-        confirmed = assign(overlap, config.match_iou) >= 0
+        confirmed |= assign(overlap, config.match_iou) >= 0
+        visible |= seen
     bottoms = lidar.boxes[:, 2] - lidar.boxes[:, 5] / 2
     return _Observed(lidar.labels, lidar.scores, bottoms, visible, confirmed)
 

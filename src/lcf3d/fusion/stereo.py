@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field, model_validator
+from typing_extensions import Self
 
 from lcf3d.errors import ConfigError
 from lcf3d.fusion.branches import Branches
 from lcf3d.fusion.clustering import Clusters
-from lcf3d.fusion.config import PRESETS, FusionConfig
+from lcf3d.fusion.config import FusionConfig
+from lcf3d.fusion.decisions import ClusterDecisions
 from lcf3d.fusion.localizer import Localizer
 from lcf3d.fusion.matching import Matches, View
-from lcf3d.fusion.outcome import ClusterOutcome
 from lcf3d.fusion.pipeline import LateCascadeFusion
 from lcf3d.fusion.semantic import fuse_scores
 from lcf3d.fusion.stereo_pairing import check_not_exchanged, check_stereo_pair, pair_views
@@ -48,17 +50,14 @@ class StereoConfig(FusionConfig):
         return self
 
     @classmethod
-    def preset(cls, name: str) -> StereoConfig:
+    def preset(cls, name: str, **changes: Any) -> Self:
         """The settings of `FusionConfig.preset` with the stereo values; ``paper`` discards and checks no depth.
 
         Raises:
-            ConfigError: there is no such preset.
+            ConfigError: there is no such preset, or a change makes no sense.
         """
-        FusionConfig.preset(name)
-        values: dict[str, Any] = {**PRESETS[name], "match_iou": 0.5}
-        if name == "paper":
-            values.update(check_depth=False, unpaired="discard")
-        return cls(**values)
+        own: dict[str, Any] = {"check_depth": False, "unpaired": "discard"} if name == "paper" else {}
+        return super().preset(name, **{**own, **changes})
 
 
 class _Pair(NamedTuple):
@@ -89,7 +88,9 @@ class StereoLateCascadeFusion(LateCascadeFusion):
     def __init__(self, config: StereoConfig | None = None, localizer: Localizer | None = None, **options: Any) -> None:
         super().__init__(config or StereoConfig(), localizer, **options)
 
-    def __call__(self, frame: Frame, lidar: Detections3D, camera: Mapping[str, Detections2D]) -> FusedDetections:
+    def __call__(
+        self, frame: Frame, lidar: Detections3D, camera: Mapping[str, Detections2D] | Detections2D
+    ) -> FusedDetections:
         """Fuse the detections of one frame; see `LateCascadeFusion.__call__`.
 
         Raises:
@@ -97,8 +98,8 @@ class StereoLateCascadeFusion(LateCascadeFusion):
         """
         fused = super().__call__(frame, lidar, camera)
         table = fused.camera
-        table.reason[(table.reason == Reason.OTHER_VIEW) & (table.pair >= 0)] = Reason.SECOND_VIEW
-        return fused
+        second = (table.reason == Reason.OTHER_VIEW) & (table.pair >= 0)
+        return replace(fused, camera=replace(table, reason=np.where(second, Reason.SECOND_VIEW, table.reason)))
 
     def _prepare(self, frame: Frame, lidar: Detections3D, camera: Mapping[str, Detections2D]) -> Branches:
         """Both branches, the pairs checked, and a note on every pair that is not whole."""
@@ -136,15 +137,15 @@ class StereoLateCascadeFusion(LateCascadeFusion):
 
     def _decide(
         self, branches: Branches, clusters: Clusters, views: Sequence[View], matches: Matches
-    ) -> ClusterOutcome:
+    ) -> ClusterDecisions:
         """Stereo semantic fusion (section 4.2.4): the second view's score joins where the views' labels agree."""
-        outcome = super()._decide(branches, clusters, views, matches)
+        decisions = super()._decide(branches, clusters, views, matches)
         for pair in self._pairs(branches):
-            self._fuse_second_views(pair, branches, views, matches, outcome)
-        return outcome
+            self._fuse_second_views(pair, branches, views, matches, decisions)
+        return decisions
 
     def _fuse_second_views(
-        self, pair: _Pair, branches: Branches, views: Sequence[View], matches: Matches, outcome: ClusterOutcome
+        self, pair: _Pair, branches: Branches, views: Sequence[View], matches: Matches, decisions: ClusterDecisions
     ) -> None:
         """Multiply in ``s2d / p`` of the second view of clusters matched in both, and note the views as a pair.
 
@@ -158,14 +159,14 @@ class StereoLateCascadeFusion(LateCascadeFusion):
             rows, other_rows = _rows(branches, first, matches.detection[both]), _rows(branches, second, other)
             table = branches.camera_table
             table.pair[rows], table.pair[other_rows] = other_rows, rows
-            branches.lidar_table.pair[branches.lidar_index[outcome.box[both]]] = other_rows
+            branches.lidar_table.pair[branches.lidar_index[decisions.box[both]]] = other_rows
             if self.config.ensemble == "evidence" or self.config.ensemble == "none":
                 continue
             found = branches.camera[second]
-            agreed = found.labels[other] == outcome.labels[both]
+            agreed = found.labels[other] == decisions.labels[both]
             both, other = both[agreed], other[agreed]
-            outcome.scores[both] = fuse_scores(
-                outcome.scores[both], found.scores[other], priors[outcome.labels[both]], self.config.ensemble
+            decisions.scores[both] = fuse_scores(
+                decisions.scores[both], found.scores[other], priors[decisions.labels[both]], self.config.ensemble
             )
 
     def _choose_candidates(self, branches: Branches, free: list[IntArray]) -> tuple[list[IntArray], IntArray]:

@@ -4,28 +4,24 @@ OUT/config.yaml          the settings used
 OUT/run.json             what was run: dataset, detectors, version
 OUT/calibration.json     the score calibration used, if any
 OUT/provenance/ID.json   why each input and output of the frame is there or not
-OUT/data/ID.txt          KITTI: result file of a frame
-OUT/results.json         nuScenes: submission of all samples
+OUT/...                  results in the dataset's own form: data/ID.txt for KITTI, results.json for nuScenes
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-import numpy as np
-
+from lcf3d.datasets.base import ResultWriter
 from lcf3d.errors import ConfigError
 from lcf3d.files import read_json, write_json
-from lcf3d.formats.kitti import objects_from_detections, write_objects
 from lcf3d.fusion.config import FusionConfig
-from lcf3d.geometry.camera import project_boxes
 from lcf3d.provenance import FusedDetections
-from lcf3d.structures import FloatArray, Frame
+from lcf3d.structures import Frame
 
-if TYPE_CHECKING:
-    from lcf3d.datasets.nuscenes import NuscenesDataset
+FORMAT = 2
+"""Of run folders; those of version 1 (lcf3d 0.1) are read, but not resumed."""
 
 
 class RunFolder:
@@ -33,10 +29,17 @@ class RunFolder:
 
     Args:
         path: the folder.
+        writer: writes results in the dataset's form; None for a folder that is only read.
     """
 
-    def __init__(self, path: Path | str) -> None:
+    def __init__(self, path: Path | str, writer: ResultWriter | None = None) -> None:
         self.path = Path(path)
+        self._writer = writer
+
+    @staticmethod
+    def is_run(path: Path) -> bool:
+        """Whether a folder was written by ``lcf3d run``."""
+        return (path / "run.json").is_file() and (path / "provenance").is_dir()
 
     @property
     def calibration_path(self) -> Path:
@@ -47,6 +50,24 @@ class RunFolder:
         """The provenance file of a frame."""
         return self.path / "provenance" / f"{frame_id}.json"
 
+    def request(self) -> dict[str, Any]:
+        """What was run, as ``run.json`` has it.
+
+        Raises:
+            FormatError: it is not there or not JSON.
+            ConfigError: it was written by a later version of lcf3d.
+        """
+        content = read_json(self.path / "run.json")
+        if not isinstance(content, dict):
+            raise ConfigError(f"{self.path / 'run.json'} does not say what was run")
+        version = content.get("format", 1)
+        if not isinstance(version, int) or version > FORMAT:
+            raise ConfigError(
+                f"{self.path} is a run of format {version}, written by lcf3d {content.get('lcf3d', '?')}; this lcf3d "
+                f"reads formats up to {FORMAT}: upgrade it"
+            )
+        return content
+
     def begin(self, config: FusionConfig, run: dict[str, Any], *, resume: bool, overwrite: bool) -> None:
         """Write the settings, unless the folder already holds a run.
 
@@ -54,6 +75,7 @@ class RunFolder:
             ConfigError: it holds one and neither ``resume`` nor ``overwrite`` is set, or ``resume`` is and that run had
                 other settings or inputs.
         """
+        run = {"format": FORMAT, **run}
         settings, inputs = self.path / "config.yaml", self.path / "run.json"
         if self.path.is_file():
             raise ConfigError(f"{self.path} is a file; choose a folder for --out")
@@ -70,21 +92,31 @@ class RunFolder:
         elif occupied:
             if not inputs.is_file():
                 raise ConfigError(f"{self.path} holds files of something else; choose another --out")
-            for file in (*self.path.glob("data/*.txt"), *self.path.glob("provenance/*.json"), self.calibration_path):
+            results = () if self._writer is None else self._writer.written()
+            for file in (*results, *self.path.glob("provenance/*.json"), self.calibration_path):
                 file.unlink(missing_ok=True)
         write_json(inputs, run)
         config.dump(settings)
 
+    def frame_ids(self) -> list[str]:
+        """Frames that are done, sorted."""
+        return sorted(path.stem for path in (self.path / "provenance").glob("[!.]*.json"))
+
     def is_done(self, frame_id: str) -> bool:
         """Whether the files of a frame are there."""
-        return self.provenance_path(frame_id).is_file()
+        own = self._writer is None or self._writer.is_done(frame_id)
+        return own and self.provenance_path(frame_id).is_file()
 
     def write(self, frame: Frame, fused: FusedDetections) -> None:
-        """Write the files of a frame."""
+        """Write the files of a frame, those in the dataset's form last."""
         write_json(self.provenance_path(frame.id), fused.to_json(), indent=None)
+        if self._writer is not None:
+            self._writer.write(frame, fused)
 
     def finish(self, frame_ids: Sequence[str]) -> None:
-        """Write what belongs to all frames together; nothing here."""
+        """Write what belongs to all frames together."""
+        if self._writer is not None:
+            self._writer.finish(frame_ids, self.read)
 
     def read(self, frame_id: str) -> FusedDetections:
         """The result of a frame with its provenance.
@@ -93,60 +125,3 @@ class RunFolder:
             FormatError: it is not there or not readable.
         """
         return FusedDetections.from_json(read_json(self.provenance_path(frame_id)))
-
-
-class KittiRunFolder(RunFolder):
-    """A run on KITTI layout, with a result file a frame."""
-
-    def result_path(self, frame_id: str) -> Path:
-        """The KITTI result file of a frame."""
-        return self.path / "data" / f"{frame_id}.txt"
-
-    def is_done(self, frame_id: str) -> bool:
-        """Whether both files of a frame are there."""
-        return self.result_path(frame_id).is_file() and super().is_done(frame_id)
-
-    def write(self, frame: Frame, fused: FusedDetections) -> None:
-        """Write the two files of a frame, the result last."""
-        super().write(frame, fused)
-        camera_from_lidar = frame.cameras[0].camera_from_lidar
-        objects = objects_from_detections(fused.detections, image_boxes(frame, fused), camera_from_lidar)
-        write_objects(self.result_path(frame.id), objects)
-
-
-class NuscenesRunFolder(RunFolder):
-    """A run on nuScenes, with one submission file of all samples.
-
-    Args:
-        path: the folder.
-        dataset: the samples.
-    """
-
-    def __init__(self, path: Path | str, dataset: NuscenesDataset) -> None:
-        super().__init__(path)
-        self.dataset = dataset
-
-    @property
-    def result_path(self) -> Path:
-        """The submission file."""
-        return self.path / "results.json"
-
-    def finish(self, frame_ids: Sequence[str]) -> None:
-        """Write the submission from the samples' provenance files; samples not run have no boxes in it."""
-        detections = {frame_id: self.read(frame_id).detections for frame_id in frame_ids}
-        self.dataset.write_results(self.result_path, detections)
-
-
-def image_boxes(frame: Frame, fused: FusedDetections) -> FloatArray:
-    """(N, 4) boxes of the outputs in the frame's first camera.
-
-    The 2D detection where one led to the output, since a detector draws what is visible; else the 3D box's projection,
-    clipped to the image (zeros where it is not in view).
-    """
-    camera = frame.cameras[0]
-    boxes, _ = project_boxes(fused.detections.boxes, camera)
-    if camera.name in fused.camera_names:
-        c = fused.camera_names.index(camera.name)
-        rows = np.flatnonzero((fused.camera.camera == c) & (fused.camera.output >= 0))
-        boxes[fused.camera.output[rows]] = fused.camera_inputs[c].boxes[fused.camera.detection[rows]]
-    return boxes

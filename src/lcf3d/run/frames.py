@@ -10,19 +10,11 @@ from multiprocessing import get_context
 from time import perf_counter
 from typing import Any, Protocol
 
+from lcf3d.datasets.base import CameraSource, Dataset, LidarSource
 from lcf3d.errors import DatasetError
-from lcf3d.provenance import FusedDetections, Reason, Stage
+from lcf3d.provenance import FusedDetections, Outcome, Reason
 from lcf3d.run.folder import RunFolder
-from lcf3d.run.sources import CameraSource, LidarSource
 from lcf3d.structures import Detections2D, Detections3D, Frame
-
-
-class FrameDataset(Protocol):
-    """What a run asks of a dataset."""
-
-    def frame(self, frame_id: str, /) -> Frame:
-        """The frame of that id."""
-        ...
 
 
 class Fusion(Protocol):
@@ -39,7 +31,7 @@ class FrameSummary:
 
     Attributes:
         frame_id: the frame.
-        outputs: fused detections by stage and class, for example ``("recovered", "Pedestrian")``.
+        outputs: fused detections by outcome and class, for example ``("recovered", "Pedestrian")``.
         dropped: LiDAR detections dropped, by reason.
         notes: what was missing or left out.
         milliseconds: by part: ``lidar``, ``camera``, ``fusion``, ``write``.
@@ -64,7 +56,7 @@ class FrameRunner:
         folder: where results go.
     """
 
-    dataset: FrameDataset
+    dataset: Dataset
     lidar: LidarSource
     cameras: dict[str, CameraSource]
     fusion: Fusion
@@ -124,8 +116,8 @@ def summarize(frame_id: str, fused: FusedDetections, milliseconds: dict[str, flo
     """Count what the fusion of one frame decided."""
     names = fused.detections.class_names
     outputs = Counter(
-        (Stage(stage).name.lower(), names[label])
-        for stage, label in zip(fused.stages, fused.detections.labels, strict=True)
+        (Outcome(outcome).name.lower(), names[label])
+        for outcome, label in zip(fused.outcomes, fused.detections.labels, strict=True)
     )
     dropped = Counter(Reason(reason).name.lower() for reason in fused.lidar.reason[fused.dropped_lidar])
     return FrameSummary(frame_id, outputs, dropped, milliseconds=milliseconds)
@@ -174,14 +166,14 @@ def total(summaries: Sequence[FrameSummary]) -> dict[str, Any]:
         outputs += summary.outputs
         dropped += summary.dropped
         notes.update(set(summary.notes))
-    by_stage: dict[str, dict[str, int]] = {}
-    for (stage, name), count in sorted(outputs.items()):
-        by_stage.setdefault(stage, {})[name] = count
+    by_outcome: dict[str, dict[str, int]] = {}
+    for (outcome, name), count in sorted(outputs.items()):
+        by_outcome.setdefault(outcome, {})[name] = count
     parts = summaries[0].milliseconds if summaries else {}
     medians = {part: sorted(s.milliseconds[part] for s in summaries)[len(summaries) // 2] for part in parts}
     return {
         "frames": len(summaries),
-        "outputs": by_stage,
+        "outputs": by_outcome,
         "dropped_lidar": dict(sorted(dropped.items())),
         "notes": dict(notes.most_common()),
         "median_ms": {part: round(value, 3) for part, value in medians.items()},

@@ -1,7 +1,9 @@
-"""Options that several verbs share."""
+"""Settings from a preset or file and ``name=value`` items, as the command line and `lcf3d.run` take them."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import yaml
@@ -11,11 +13,11 @@ from lcf3d.fusion.config import FusionConfig
 from lcf3d.fusion.stereo import StereoConfig
 
 
-def build_config(name_or_path: str, changes: list[str], stereo: bool = False) -> FusionConfig:
+def build_config(name_or_path: str | Path, changes: Sequence[str] = (), stereo: bool = False) -> FusionConfig:
     """Settings from a preset or file, changed by ``name=value`` items; those of stereo pairs if ``stereo``.
 
     Raises:
-        ConfigError: unknown preset, file, setting or value.
+        ConfigError: unknown preset, file, setting or value, or one that has no effect under the others.
     """
     config = (StereoConfig if stereo else FusionConfig).load(name_or_path)
     values: dict[str, Any] = {}

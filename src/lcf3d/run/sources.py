@@ -2,31 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from collections.abc import Mapping, Sequence
+from typing import Any
 
+from lcf3d.datasets.base import CameraSource, Dataset, LidarSource
 from lcf3d.detectors.base import CameraDetector, LidarDetector
+from lcf3d.detectors.named import load_detector
 from lcf3d.errors import DatasetError
 from lcf3d.structures import Detections2D, Detections3D, Frame
-
-
-class LidarSource(Protocol):
-    """The LiDAR branch of a run."""
-
-    def detect(self, frame: Frame) -> Detections3D:
-        """3D detections of one frame in its LiDAR frame."""
-        ...
-
-
-class CameraSource(Protocol):
-    """The camera branch of a run."""
-
-    def sees(self, frame: Frame, camera: str) -> bool:
-        """Whether there is anything to detect from: a camera without it is not used in that frame."""
-        ...
-
-    def detect(self, frame: Frame, camera: str) -> Detections2D:
-        """2D detections of one camera of one frame."""
-        ...
 
 
 class LidarOnScans:
@@ -59,3 +42,37 @@ class CameraOnImages:
     def detect(self, frame: Frame, camera: str) -> Detections2D:
         """Run the detector."""
         return self.detector([frame.images[camera]])[0]
+
+
+def open_lidar(text: str, dataset: Dataset, class_names: Sequence[str], missing: str = "error") -> LidarSource:
+    """The LiDAR branch that a string names: a detector to run on the scans, or ``results:PATH``.
+
+    Raises:
+        Lcf3dError: there is no such detector, or it cannot be loaded.
+    """
+    loaded: Any = load_detector(text, "lidar", class_names, {"missing": missing}, dataset)
+    return loaded if hasattr(loaded, "detect") else LidarOnScans(loaded)
+
+
+def open_cameras(
+    texts: Mapping[str, str], dataset: Dataset, class_names: Sequence[str], missing: str = "error", tiles: int = 1
+) -> dict[str, CameraSource]:
+    """The camera branch of each camera; a detector that is named twice is loaded once.
+
+    Args:
+        texts: what the detector of each camera is called, by camera name.
+        dataset: whose images they are to see.
+        class_names: classes of the detections.
+        missing: what to do about absent result files.
+        tiles: overlapping tiles across wide images, for detectors that know them.
+
+    Raises:
+        Lcf3dError: there is no such detector, or it cannot be loaded.
+    """
+    defaults: dict[str, Any] = {"missing": missing, **({"tiles": tiles} if tiles > 1 else {})}
+    by_text: dict[str, CameraSource] = {}
+    for text in texts.values():
+        if text not in by_text:
+            loaded: Any = load_detector(text, "camera", class_names, defaults, dataset)
+            by_text[text] = loaded if hasattr(loaded, "detect") else CameraOnImages(loaded)
+    return {name: by_text[text] for name, text in texts.items()}

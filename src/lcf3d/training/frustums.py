@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from lcf3d.datasets.kitti import KittiDataset
 from lcf3d.datasets.nuscenes import NuscenesDataset
-from lcf3d.datasets.opening import parse_dataset
+from lcf3d.datasets.opening import root_of
 from lcf3d.errors import DatasetError
 from lcf3d.formats.kitti import read_objects
 from lcf3d.fusion.frustum import enlarge_boxes, points_in_image_boxes
@@ -205,7 +205,7 @@ def scenes_of_dataset(text: str, split: str | None) -> Iterator[LabelledScene]:
     Raises:
         DatasetError: a frame without scan or labels, or a folder that is no such dataset.
     """
-    kind, root = parse_dataset(text)
+    kind, root = root_of(text, ("kitti", "nuscenes"), "the training")
     if kind == "nuscenes":
         dataset = NuscenesDataset(root, split=split, late_cameras="drop")
         for token in dataset.ids:

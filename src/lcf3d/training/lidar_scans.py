@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lcf3d.datasets.opening import parse_dataset
+from lcf3d.datasets.opening import root_of
 from lcf3d.detectors.classes import class_mapping
 from lcf3d.errors import ConfigError, DatasetError
 from lcf3d.geometry.boxes import points_in_boxes
@@ -95,7 +95,7 @@ def dataset_scans(
         DatasetError: the dataset or the split does not exist.
         ConfigError: the kind of dataset is unknown.
     """
-    kind, root = parse_dataset(dataset)
+    kind, root = root_of(dataset, ("kitti", "nuscenes"), "the training")
     if kind == "kitti":
         from lcf3d.datasets.kitti import KittiDataset
 

@@ -92,8 +92,8 @@ def draw_bev(
         for box in scene.truth:
             canvas.lines(_outline(box, view), TRUTH_COLOUR, width=1.0, opacity=0.85)
     for i in scene.drawing_order:
-        colour, outline = COLOURS[scene.stages[i]], _outline(scene.boxes[i], view)
-        if scene.stages[i] == "dropped":
+        colour, outline = COLOURS[scene.outcomes[i]], _outline(scene.boxes[i], view)
+        if scene.outcomes[i] == "dropped":
             canvas.lines(outline, colour, width=1.0, opacity=0.75, dashed=True)
         else:
             canvas.lines(outline, colour, width=2.0)
@@ -102,7 +102,7 @@ def draw_bev(
         around = [*corners.min(axis=0).tolist(), *corners.max(axis=0).tolist()]
         shown = around[0] >= 0 and around[2] <= view.width and around[1] >= 0 and around[3] <= view.height
         if text and shown:
-            canvas.label(around, text, COLOURS[scene.stages[i]], size=11, filled=False)
+            canvas.label(around, text, COLOURS[scene.outcomes[i]], size=11, filled=False)
     return canvas.image()
 
 

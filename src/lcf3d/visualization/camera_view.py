@@ -100,17 +100,17 @@ def _draw_boxes(canvas: Canvas, camera: Camera, scene: Scene) -> None:
     order = [i for i in scene.drawing_order if visible[i]]
     for i in order:
         front, depths = project_points(box_corners(scene.boxes[i : i + 1])[0, _FRONT], camera)
-        if scene.stages[i] != "dropped" and (depths > NEAR).all():
-            canvas.polygon(front, COLOURS[scene.stages[i]], 0.16)
+        if scene.outcomes[i] != "dropped" and (depths > NEAR).all():
+            canvas.polygon(front, COLOURS[scene.outcomes[i]], 0.16)
     for i in order:
-        if scene.stages[i] == "dropped":
+        if scene.outcomes[i] == "dropped":
             canvas.lines(edges[i], COLOURS["dropped"], width=1.0, opacity=0.65, dashed=True)
         else:
-            canvas.lines(edges[i], COLOURS[scene.stages[i]], width=1.8, halo=True)
+            canvas.lines(edges[i], COLOURS[scene.outcomes[i]], width=1.8, halo=True)
     size = 12.0 if canvas.width > SMALL_PANEL else 10.0
     for i in range(len(scene.texts)):
         if visible[i] and scene.texts[i] and _is_legible(extents[i]):
-            canvas.label(extents[i].tolist(), scene.texts[i], COLOURS[scene.stages[i]], size)
+            canvas.label(extents[i].tolist(), scene.texts[i], COLOURS[scene.outcomes[i]], size)
 
 
 def _draw_image_boxes(canvas: Canvas, camera: Camera, scene: Scene, scale: float) -> None:

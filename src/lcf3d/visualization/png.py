@@ -77,7 +77,7 @@ def _camera_panels(frame: Frame, cameras: Sequence[Camera], scene: Scene) -> lis
 def _legend(title: str, scene: Scene, width: int) -> PIL.Image.Image:
     """A bar with the frame's id and what the colours mean, with counts; wrapped where it is too long."""
     entries: list[tuple[str, Colour, bool]] = [
-        (f"{stage} {count}", COLOURS[stage], stage == "dropped") for stage, count in scene.counts.items()
+        (f"{outcome} {count}", COLOURS[outcome], outcome == "dropped") for outcome, count in scene.counts.items()
     ]
     if scene.image_boxes:
         used = sum(int(found.used.sum()) for found in scene.image_boxes.values())

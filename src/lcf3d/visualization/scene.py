@@ -1,4 +1,4 @@
-"""What a picture shows: boxes with their stage in the fusion and a text, apart from where they came from."""
+"""What a picture shows: boxes with their outcome in the fusion and a text, apart from where they came from."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from lcf3d.provenance import FusedDetections, Reason, Stage
+from lcf3d.provenance import FusedDetections, Outcome, Reason
 from lcf3d.structures import BoolArray, Detections2D, Detections3D, FloatArray
 from lcf3d.visualization.canvas import Colour
 
@@ -47,28 +47,28 @@ class Scene:
 
     Attributes:
         boxes: (N, 7) canonical boxes.
-        stages: (N,) keys of `COLOURS`.
+        outcomes: (N,) keys of `COLOURS`.
         texts: (N,) labels, empty for none; earlier boxes get their labels first.
         image_boxes: 2D detections by camera name.
         truth: (K, 7) ground truth, or None.
     """
 
     boxes: FloatArray
-    stages: tuple[str, ...]
+    outcomes: tuple[str, ...]
     texts: tuple[str, ...]
     image_boxes: Mapping[str, ImageBoxes] = field(default_factory=dict)
     truth: FloatArray | None = None
 
     @property
     def counts(self) -> dict[str, int]:
-        """Number of boxes of each stage that occurs, in the order of `COLOURS`."""
-        return {stage: self.stages.count(stage) for stage in COLOURS if stage in self.stages}
+        """Number of boxes of each outcome that occurs, in the order of `COLOURS`."""
+        return {outcome: self.outcomes.count(outcome) for outcome in COLOURS if outcome in self.outcomes}
 
     @property
     def drawing_order(self) -> list[int]:
         """Indices of the boxes, the important ones last, so that they lie on top."""
         rank = list(COLOURS)
-        return sorted(range(len(self.stages)), key=lambda i: (-rank.index(self.stages[i]), -i))
+        return sorted(range(len(self.outcomes)), key=lambda i: (-rank.index(self.outcomes[i]), -i))
 
     @classmethod
     def from_detections(
@@ -96,21 +96,21 @@ class Scene:
     def from_fused(
         cls, fused: FusedDetections, truth: Detections3D | None = None, least_score: float = -np.inf
     ) -> Scene:
-        """Outputs of a fusion in the colour of their stage, and the inputs that were dropped on the way.
+        """Outputs of a fusion in the colour of their outcome, and the inputs that were dropped on the way.
 
         Outputs and inputs of a lower score than ``least_score`` are left out.
         """
-        stages = [Stage(stage).name.lower() for stage in fused.stages]
+        outcomes = [Outcome(outcome).name.lower() for outcome in fused.outcomes]
         lowered = fused.lidar.output[fused.lidar.reason == Reason.DOWNWEIGHTED]
         for output in lowered[lowered >= 0]:
-            stages[output] = "downweighted"
+            outcomes[output] = "downweighted"
         dropped = fused.dropped_lidar
         dropped = dropped[~np.isin(fused.lidar.reason[dropped], _NOT_DRAWN)]
         dropped = dropped[fused.lidar_inputs.scores[dropped] >= least_score]
         shown = np.flatnonzero(fused.detections.scores >= least_score)
         return cls(
             np.concatenate([fused.detections.boxes[shown], fused.lidar_inputs.boxes[dropped]]),
-            (*(stages[i] for i in shown), *("dropped",) * len(dropped)),
+            (*(outcomes[i] for i in shown), *("dropped",) * len(dropped)),
             (*_texts(fused.detections[shown]), *("",) * len(dropped)),
             _image_boxes(fused, least_score),
             None if truth is None else truth.boxes,
@@ -124,7 +124,7 @@ def _image_boxes(fused: FusedDetections, least_score: float) -> dict[str, ImageB
         rows = np.flatnonzero((fused.camera.camera == c) & ~np.isin(fused.camera.reason, _NOT_DRAWN))
         rows = rows[found.scores[fused.camera.detection[rows]] >= least_score]
         chosen = found[fused.camera.detection[rows]]
-        used = fused.camera.stage[rows] != Stage.DROPPED
+        used = fused.camera.outcome[rows] != Outcome.DROPPED
         texts = [
             "" if ok else f"{text} {Reason(reason).name.lower().replace('_', ' ')}"
             for text, ok, reason in zip(_texts(chosen), used, fused.camera.reason[rows], strict=True)

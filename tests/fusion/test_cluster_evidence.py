@@ -1,17 +1,18 @@
-"""Fusion by evidence through the pipeline: rivals, weak detections, classes that a camera does not know."""
+"""Fusion by evidence through the pipeline: competitors, weak detections, classes that a camera does not know."""
 
 import numpy as np
 import pytest
 
 from lcf3d import FusionConfig, LateCascadeFusion
 from lcf3d.fusion.calibration import Calibration, ScoreMap
+from lcf3d.fusion.cluster_evidence import competing_scores
 from lcf3d.fusion.evidence import Evidence, to_probability
-from lcf3d.fusion.weighing import rival_scores
 from lcf3d.structures import KITTI_CLASSES, Detections2D
 from tests.fusion.scenes import (
     CAR,
     CYCLIST,
     PEDESTRIAN,
+    PLAIN,
     TrueLocalizer,
     camera,
     car,
@@ -37,7 +38,7 @@ def none2d():
 
 
 def test_scores_follow_the_formula():
-    weights = Evidence(base=-1, trust=0.5, support=(1, 2, 3, 4), miss=0.5, off_ground=0, rival=0)
+    weights = Evidence(base=-1, trust=0.5, support=(1, 2, 3, 4), miss=0.5, off_ground=0, competing=0)
     evidence = {"Car": weights.model_dump()}
     fused = fuse(lidar([NEAR], [0.8]), seen(camera(), [NEAR], [0.5]), evidence=evidence)
     assert fused.detections.scores[0] == pytest.approx(to_probability(-1 + 0.5 * np.log(4) + 0.5 * 4))
@@ -71,13 +72,13 @@ def test_unbounded_scores_need_a_calibration():
         fuse(lidar([NEAR], [3.0]), none2d())
 
 
-def test_boxes_of_a_class_the_camera_does_not_know_are_not_judged():
+def test_boxes_of_a_class_the_camera_does_not_know_are_class_not_detected():
     calibration = Calibration(camera_classes=("Car", "Pedestrian"))
     rider = seen(camera(), [WALKER], [0.9], [PEDESTRIAN])
     fused = fuse(lidar([WALKER], [0.6], [CYCLIST]), rider, calibration, unmatched="drop")
     assert fused.detections.labels.tolist() == [CYCLIST]
     assert fused.detections.scores.tolist() == [0.6]
-    assert fused.lidar.row(0)["reason"] == "not_judged"
+    assert fused.lidar.row(0)["reason"] == "class_not_detected"
     known = fuse(lidar([WALKER], [0.6], [CYCLIST]), rider, unmatched="drop")
     assert known.detections.labels.tolist() == [PEDESTRIAN]
 
@@ -100,13 +101,13 @@ def test_weak_detections_support_but_neither_relabel_nor_recover():
     assert fused.camera.row(1)["reason"] == "low_score"
     assert len(fused) == 2
     strong = seen(camera(), [NEAR, WALKER], [0.8, 0.8], [CAR, PEDESTRIAN])
-    assert fuse(lidar([NEAR], [0.6]), strong, points=points).stages.tolist().count(1) == 1
+    assert fuse(lidar([NEAR], [0.6]), strong, points=points).outcomes.tolist().count(1) == 1
 
 
 def test_recovered_boxes_rank_below_confirmed_ones():
     both = seen(camera(), [NEAR, WALKER], [0.9, 0.9], [CAR, PEDESTRIAN])
     fused = fuse(lidar([NEAR], [0.6]), both, points=surface_points([NEAR, WALKER]))
-    recovered = fused.detections.scores[fused.stages == 1]
+    recovered = fused.detections.scores[fused.outcomes == 1]
     assert recovered == pytest.approx([0.9 * 0.7], abs=1e-6)
 
 
@@ -120,9 +121,9 @@ def test_rivals_are_better_boxes_of_another_class_in_the_clique():
     config = FusionConfig(class_aware=True)
     boxes = np.array([WALKER, BICYCLE, FAR], dtype=float)
     labels = np.array([PEDESTRIAN, CYCLIST, CAR])
-    assert rival_scores(boxes, np.array([0.5, 0.8, 0.9]), labels, config).tolist() == [0.8, 0, 0]
-    assert rival_scores(boxes, np.array([0.5, 0.8, 0.9]), labels, FusionConfig()).tolist() == [0, 0, 0]
-    assert rival_scores(boxes, np.array([0.5, 0.8, 0.9]), labels * 0, config).tolist() == [0, 0, 0]
+    assert competing_scores(boxes, np.array([0.5, 0.8, 0.9]), labels, config).tolist() == [0.8, 0, 0]
+    assert competing_scores(boxes, np.array([0.5, 0.8, 0.9]), labels, FusionConfig(**PLAIN)).tolist() == [0, 0, 0]
+    assert competing_scores(boxes, np.array([0.5, 0.8, 0.9]), labels * 0, config).tolist() == [0, 0, 0]
 
 
 def test_weigh_gives_what_the_scores_are_made_of():
@@ -130,7 +131,7 @@ def test_weigh_gives_what_the_scores_are_made_of():
     fusion = LateCascadeFusion(config, TrueLocalizer([NEAR]), Calibration(camera_classes=("Car",)))
     found = lidar([car(-20), FAR, NEAR, WALKER], [0.9, 0.7, 0.6, 0.5], [CAR, CAR, CAR, PEDESTRIAN])
     two_d = {"left": seen(camera(), [NEAR], [0.8])}
-    weighed = fusion.weigh(frame([camera()]), found, two_d)
+    weighed = fusion.evidence(frame([camera()]), found, two_d)
     assert sorted(weighed.box.tolist()) == [0, 1, 2, 3]
     assert weighed.agreed[np.argsort(weighed.box)].tolist() == [False, True, True, False]
     fused = fusion(frame([camera()]), found, two_d)

@@ -3,13 +3,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from lcf3d.evaluation.kitti_fates import fates, fusion_fates, read_provenance
 
 from lcf3d.errors import FormatError
 from lcf3d.evaluation.kitti import KittiEvaluator, Selection
-from lcf3d.evaluation.kitti_fates import fates, fusion_fates, read_provenance
 from lcf3d.evaluation.kitti_study import study, worst_frames
 from lcf3d.geometry.boxes import lidar_from_kitti
-from lcf3d.provenance import Decisions, FusedDetections, Reason, Stage
+from lcf3d.provenance import Decisions, FusedDetections, Outcome, Reason
 from lcf3d.structures import Detections3D
 
 from .kitti_frames import frames
@@ -36,11 +36,11 @@ def fusion() -> tuple[list[dict[str, object]], list[dict[str, object]], FusedDet
     lidar = [car(0, score=0.9), car(10, score=0.8), car(-10, score=0.7), car(-20, score=0.6), car(15, score=0.5)]
     output = [car(0, score=0.95), car(-10, score=0.7), car(5, score=0.6)]
     table = Decisions.blank(5)
-    table.stage[:] = [Stage.MATCHED, Stage.DROPPED, Stage.KEPT, Stage.DROPPED, Stage.DROPPED]
+    table.outcome[:] = [Outcome.MATCHED, Outcome.DROPPED, Outcome.KEPT, Outcome.DROPPED, Outcome.DROPPED]
     table.reason[:] = [Reason.CONFIRMED, Reason.UNCONFIRMED, Reason.DOWNWEIGHTED, Reason.UNCONFIRMED, Reason.LOW_SCORE]
     table.output[:] = [0, -1, 1, -1, -1]
     camera = Decisions.blank(1)
-    camera.stage[:], camera.reason[:], camera.output[:] = Stage.RECOVERED, Reason.LOCALIZED, 2
+    camera.outcome[:], camera.reason[:], camera.output[:] = Outcome.RECOVERED, Reason.LOCALIZED, 2
     fused = FusedDetections(detections(output), table, camera, detections(lidar), (), ("left",))
     return truth, output, fused
 

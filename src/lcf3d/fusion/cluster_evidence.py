@@ -23,7 +23,7 @@ from lcf3d.fusion.matching import Matches, View
 from lcf3d.structures import BoolArray, FloatArray, IntArray
 
 
-class Weighed(NamedTuple):
+class ClusterEvidence(NamedTuple):
     """One row a cluster.
 
     Attributes:
@@ -39,14 +39,14 @@ class Weighed(NamedTuple):
     agreed: BoolArray
 
 
-def weigh_clusters(
+def gather_evidence(
     box: IntArray,
     branches: Branches,
     views: Sequence[View],
     matches: Matches,
     config: FusionConfig,
     calibration: Calibration,
-) -> Weighed:
+) -> ClusterEvidence:
     """Collect the evidence for every cluster, represented by the LiDAR detections ``box``."""
     lidar = branches.lidar[box]
     camera_scores, labels = np.zeros(len(box)), lidar.labels.copy()
@@ -59,16 +59,16 @@ def weigh_clusters(
         exposure = np.maximum(exposure, np.where(view.visible, plain, 0.0))
     table = evidence_table(
         to_log_odds(lidar.scores),
-        rival_scores(lidar.boxes, lidar.scores, lidar.labels, config),
+        competing_scores(lidar.boxes, lidar.scores, lidar.labels, config),
         ground_slope(lidar.boxes, calibration.ground_z),
         exposure,
         camera_scores,
         np.where(matches.camera >= 0, np.nan_to_num(matches.iou), 0.0),
     )
-    return Weighed(box, table, lidar.labels, labels == lidar.labels)
+    return ClusterEvidence(box, table, lidar.labels, labels == lidar.labels)
 
 
-def fused_scores(weighed: Weighed, config: FusionConfig, calibration: Calibration) -> FloatArray:
+def fused_scores(weighed: ClusterEvidence, config: FusionConfig, calibration: Calibration) -> FloatArray:
     """(C,) probability of every cluster."""
     scores = np.zeros(len(weighed.box))
     for label, name in enumerate(config.class_names):
@@ -79,7 +79,7 @@ def fused_scores(weighed: Weighed, config: FusionConfig, calibration: Calibratio
 
 def evidence_of(name: str, config: FusionConfig, calibration: Calibration) -> Evidence:
     """The weights of a class: those of the calibration, else those of the settings, else the defaults."""
-    return calibration.evidence.get(name) or config.evidence.get(name) or Evidence()
+    return calibration.evidence.get(name) or config.evidence_of(name)
 
 
 def recovered_trust(config: FusionConfig, calibration: Calibration) -> FloatArray:
@@ -87,15 +87,15 @@ def recovered_trust(config: FusionConfig, calibration: Calibration) -> FloatArra
     return np.array([evidence_of(name, config, calibration).recovered for name in config.class_names])
 
 
-def rival_scores(boxes: FloatArray, scores: FloatArray, labels: IntArray, config: FusionConfig) -> FloatArray:
+def competing_scores(boxes: FloatArray, scores: FloatArray, labels: IntArray, config: FusionConfig) -> FloatArray:
     """(N,) score of the best box of another class that shares a clique with each box; 0 where that is not higher.
 
     LiDAR detectors report one object under two classes; the paper's cluster-wise suppression would delete the lower,
     here it loses evidence instead.
     """
-    rival = np.zeros(len(boxes))
+    competing = np.zeros(len(boxes))
     if not config.class_aware or len(np.unique(labels)) < 2:
-        return rival
+        return competing
     cluster = cluster_boxes(boxes, scores, labels, method="cliques", iou_threshold=config.cluster_iou).index
     order = np.lexsort((labels, cluster))
     starts = np.flatnonzero(np.diff(cluster[order], prepend=-1))
@@ -105,5 +105,5 @@ def rival_scores(boxes: FloatArray, scores: FloatArray, labels: IntArray, config
         for i in members:
             others = members[(labels[members] != labels[i]) & (scores[members] > scores[i])]
             if len(others):
-                rival[i] = scores[others].max()
-    return rival
+                competing[i] = scores[others].max()
+    return competing

@@ -1,11 +1,10 @@
-"""What became of every object and detection at a working point, and what the fusion had to do with it."""
+"""What became of every object and detection at a working point, and what the fusion had to do with it: KITTI."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,15 +12,16 @@ from numpy.typing import NDArray
 from lcf3d.evaluation.curves import best_f1_score
 from lcf3d.evaluation.kitti import KittiEvaluator, Selection
 from lcf3d.evaluation.kitti_matching import COUNTS, FALSE_POSITIVE, TRUE_POSITIVE
+from lcf3d.evaluation.study import FusionOutcomes
 from lcf3d.files import read_json
 from lcf3d.formats.kitti import KittiFrames, KittiObjects
 from lcf3d.geometry.boxes import kitti_from_lidar
-from lcf3d.provenance import FusedDetections, Reason, Stage
+from lcf3d.provenance import FusedDetections, Outcome, Reason
 from lcf3d.structures import FloatArray, IntArray
 
 
 @dataclass(frozen=True, eq=False)
-class Fates:
+class WorkingPoint:
     """One class at one score threshold.
 
     Attributes:
@@ -48,43 +48,13 @@ class Fates:
         }
 
 
-def fates(evaluator: KittiEvaluator, selection: Selection, threshold: float | None = None) -> Fates:
-    """The fates at a score threshold, by default the one with the best F1."""
+def working_point(evaluator: KittiEvaluator, selection: Selection, threshold: float | None = None) -> WorkingPoint:
+    """The outcomes at a score threshold, by default the one with the best F1."""
     if threshold is None:
         threshold = best_f1_score(evaluator.events(selection))
     matches, outcomes = evaluator.match_at(selection, threshold)
     missed = (evaluator.codes(selection)[0] == COUNTS) & (matches == -1)
-    return Fates(selection, threshold, matches, missed, outcomes)
-
-
-@dataclass(frozen=True)
-class FusionFates:
-    """The fates of one class, split by what the fusion did.
-
-    Attributes:
-        class_name: evaluated class.
-        threshold: score of the working point.
-        true_positives: right detections, by what the fusion did to them: ``matched`` (confirmed by a camera),
-            ``recovered`` (found from a camera detection), ``downweighted`` or ``kept`` (without a camera's word).
-        false_positives: wrong detections, in the same way.
-        dropped_wrongly: dropped LiDAR detections of an object that is now missed, by the fusion's reason.
-        dropped_rightly: dropped LiDAR detections of no object, or of one that is reported anyway, by reason.
-        misses: missed objects: ``dropped`` by the fusion, ``below_threshold`` (reported with a lower score), or
-            ``not_proposed`` (no LiDAR detection and no output overlaps it enough).
-    """
-
-    class_name: str
-    threshold: float
-    true_positives: dict[str, int] = field(default_factory=dict)
-    false_positives: dict[str, int] = field(default_factory=dict)
-    dropped_wrongly: dict[str, int] = field(default_factory=dict)
-    dropped_rightly: dict[str, int] = field(default_factory=dict)
-    misses: dict[str, int] = field(default_factory=dict)
-
-    def to_json(self) -> dict[str, Any]:
-        """Plain JSON values."""
-        names = ("true_positives", "false_positives", "dropped_wrongly", "dropped_rightly", "misses")
-        return {"threshold": self.threshold, **{name: dict(getattr(self, name)) for name in names}}
+    return WorkingPoint(selection, threshold, matches, missed, outcomes)
 
 
 def read_provenance(results: Path, frame_ids: tuple[str, ...]) -> dict[str, FusedDetections]:
@@ -100,13 +70,13 @@ def read_provenance(results: Path, frame_ids: tuple[str, ...]) -> dict[str, Fuse
     return {frame_id: FusedDetections.from_json(read_json(path)) for frame_id, path in paths.items() if path.is_file()}
 
 
-def fusion_fates(
+def fusion_outcomes(
     evaluator: KittiEvaluator,
     provenance: Mapping[str, FusedDetections],
     camera_from_lidar: Mapping[str, FloatArray],
     selection: Selection,
-) -> FusionFates:
-    """Split the fates at the best-F1 working point by what the fusion did.
+) -> FusionOutcomes:
+    """Split the outcomes at the best-F1 working point by what the fusion did.
 
     Args:
         evaluator: of the fused results.
@@ -114,7 +84,7 @@ def fusion_fates(
         camera_from_lidar: (4, 4) rectified reference camera from LiDAR, by frame.
         selection: class, measure and difficulty.
     """
-    found = fates(evaluator, selection)
+    found = working_point(evaluator, selection)
     origins = _origins(evaluator, provenance)
     dropped, reasons = _dropped_boxes(evaluator, provenance, camera_from_lidar)
     judge = KittiEvaluator(evaluator.truth, dropped, evaluator.config)
@@ -127,9 +97,7 @@ def fusion_fates(
     was_dropped = np.zeros(len(found.missed), dtype=bool)
     was_dropped[hit] = True
     below = found.missed & ~was_dropped & (at_any_score >= 0)
-    return FusionFates(
-        selection.class_name,
-        found.threshold,
+    return FusionOutcomes(
         _tally(origins[found.outcomes == TRUE_POSITIVE]),
         _tally(origins[found.outcomes == FALSE_POSITIVE]),
         _tally(reasons[wrongly]),
@@ -159,7 +127,7 @@ def _origins(evaluator: KittiEvaluator, provenance: Mapping[str, FusedDetections
         for table in (fused.camera, fused.lidar):
             for row in np.flatnonzero(table.output >= 0).tolist():
                 lowered = table.reason[row] == Reason.DOWNWEIGHTED
-                name = "downweighted" if lowered else Stage(table.stage[row]).name.lower()
+                name = "downweighted" if lowered else Outcome(table.outcome[row]).name.lower()
                 names[table.output[row]] = name
         for row, output in _same_detections(results[f], fused):
             origins[results.starts[f] + row] = names[output]

@@ -14,23 +14,23 @@ from lcf3d.fusion.matching import Matches, View
 from lcf3d.fusion.recovery import Recovery
 from lcf3d.fusion.semantic import Ensemble, fuse_scores, semantic_fusion
 from lcf3d.geometry.iou import bev_iou
-from lcf3d.provenance import FusedDetections, Reason, Stage
+from lcf3d.provenance import FusedDetections, Outcome, Reason
 from lcf3d.structures import BoolArray, Detections3D, FloatArray, IntArray
 
 
-class ClusterOutcome(NamedTuple):
+class ClusterDecisions(NamedTuple):
     """One row a cluster.
 
     Attributes:
         box: (C,) the LiDAR detection that stands for the cluster.
-        stage: (C,) `Stage` codes.
+        outcome: (C,) `Outcome` codes.
         reason: (C,) `Reason` codes.
         scores: (C,) scores after fusion.
         labels: (C,) labels after fusion.
     """
 
     box: IntArray
-    stage: IntArray
+    outcome: IntArray
     reason: IntArray
     scores: FloatArray
     labels: IntArray
@@ -56,7 +56,7 @@ def decide_clusters(
     config: FusionConfig,
     judged: BoolArray,
     weighed: FloatArray | None = None,
-) -> ClusterOutcome:
+) -> ClusterDecisions:
     """Semantic fusion for matched clusters (Algorithm 1), the chosen policy for all others (METHOD, matching 6).
 
     Args:
@@ -71,7 +71,7 @@ def decide_clusters(
     matched = np.flatnonzero(matches.camera >= 0)
     camera_scores, camera_labels = _matched_detections(branches, matches, matched)
     scores, labels = lidar.scores[box], lidar.labels[box]
-    stage = np.full(len(box), Stage.KEPT, dtype=np.int64)
+    outcome = np.full(len(box), Outcome.KEPT, dtype=np.int64)
     reason = np.full(len(box), Reason.UNCONFIRMED, dtype=np.int64)
 
     agreed = labels[matched] == camera_labels
@@ -85,18 +85,18 @@ def decide_clusters(
         )
     if weighed is not None:
         scores[matched[agreed]] = weighed[matched[agreed]]
-    stage[matched], reason[matched] = Stage.MATCHED, Reason.CONFIRMED
+    outcome[matched], reason[matched] = Outcome.MATCHED, Reason.CONFIRMED
 
     unseen = ~matches.visible
     unseen[matched] = False
     reason[unseen] = Reason.OUT_OF_VIEW
     # with no camera at all nobody could look: the LiDAR branch then stands alone
     if config.out_of_view == "drop" and branches.cameras:
-        stage[unseen] = Stage.DROPPED
-    reason[matches.visible & ~judged] = Reason.NOT_JUDGED
+        outcome[unseen] = Outcome.DROPPED
+    reason[matches.visible & ~judged] = Reason.CLASS_NOT_DETECTED
     unconfirmed = matches.visible & judged & (matches.camera < 0)
     if config.unmatched == "drop":
-        stage[unconfirmed] = Stage.DROPPED
+        outcome[unconfirmed] = Outcome.DROPPED
     elif config.unmatched == "downweight":
         reason[unconfirmed] = Reason.DOWNWEIGHTED
         scores[unconfirmed] = (
@@ -104,7 +104,7 @@ def decide_clusters(
             if weighed is None
             else weighed[unconfirmed]
         )
-    return ClusterOutcome(box, stage, reason, scores, labels)
+    return ClusterDecisions(box, outcome, reason, scores, labels)
 
 
 def _matched_detections(branches: Branches, matches: Matches, matched: IntArray) -> tuple[FloatArray, IntArray]:
@@ -126,18 +126,20 @@ def _best_of_class(lidar: Detections3D, clusters: Clusters, cluster: int, label:
 
 
 def replace_unconfirmed(
-    outcome: ClusterOutcome, lidar: Detections3D, recovery: Recovery, duplicate_iou: float
-) -> ClusterOutcome:
+    decisions: ClusterDecisions, lidar: Detections3D, recovery: Recovery, duplicate_iou: float
+) -> ClusterDecisions:
     """Drop clusters kept without confirmation on whose spot a recovered box stands: one object comes out once."""
-    kept = np.flatnonzero(np.isin(outcome.reason, [Reason.UNCONFIRMED, Reason.DOWNWEIGHTED, Reason.NOT_JUDGED]))
-    kept = kept[outcome.stage[kept] == Stage.KEPT]
+    kept = np.flatnonzero(
+        np.isin(decisions.reason, [Reason.UNCONFIRMED, Reason.DOWNWEIGHTED, Reason.CLASS_NOT_DETECTED])
+    )
+    kept = kept[decisions.outcome[kept] == Outcome.KEPT]
     if not len(kept) or not len(recovery.found):
-        return outcome
-    overlap = bev_iou(lidar.boxes[outcome.box[kept]], recovery.boxes[recovery.found])
+        return decisions
+    overlap = bev_iou(lidar.boxes[decisions.box[kept]], recovery.boxes[recovery.found])
     gone = kept[(overlap > duplicate_iou).any(axis=1)]
-    stage, reason = outcome.stage.copy(), outcome.reason.copy()
-    stage[gone], reason[gone] = Stage.DROPPED, Reason.REPLACED
-    return outcome._replace(stage=stage, reason=reason)
+    outcomes, reason = decisions.outcome.copy(), decisions.reason.copy()
+    outcomes[gone], reason[gone] = Outcome.DROPPED, Reason.REPLACED
+    return decisions._replace(outcome=outcomes, reason=reason)
 
 
 def assemble(
@@ -145,20 +147,20 @@ def assemble(
     clusters: Clusters,
     views: Sequence[View],
     matches: Matches,
-    outcome: ClusterOutcome,
+    decisions: ClusterDecisions,
     recovery: Recovery,
     notes: Sequence[str],
 ) -> FusedDetections:
     """Output detections, highest score first, and the reason for every input."""
-    surviving = np.flatnonzero(outcome.stage != Stage.DROPPED)
+    surviving = np.flatnonzero(decisions.outcome != Outcome.DROPPED)
     found = recovery.found
-    lidar = branches.lidar[outcome.box[surviving]]
+    lidar = branches.lidar[decisions.box[surviving]]
     detections = Detections3D.concatenate(
         [
             Detections3D(
                 lidar.boxes,
-                outcome.scores[surviving],
-                outcome.labels[surviving],
+                decisions.scores[surviving],
+                decisions.labels[surviving],
                 lidar.class_names,
                 lidar.velocities,
                 lidar.attributes,
@@ -172,8 +174,8 @@ def assemble(
     cluster_output = np.full(len(clusters), -1, dtype=np.int64)
     cluster_output[surviving] = place[: len(surviving)]
 
-    _write_lidar_rows(branches, clusters, matches, outcome, cluster_output)
-    _write_camera_rows(branches, views, matches, outcome, cluster_output)
+    _write_lidar_rows(branches, clusters, matches, decisions, cluster_output)
+    _write_camera_rows(branches, views, matches, decisions, cluster_output)
     _write_recovery_rows(branches, recovery, place[len(surviving) :])
     return FusedDetections(
         detections=detections[order],
@@ -187,18 +189,18 @@ def assemble(
 
 
 def _write_lidar_rows(
-    branches: Branches, clusters: Clusters, matches: Matches, outcome: ClusterOutcome, cluster_output: IntArray
+    branches: Branches, clusters: Clusters, matches: Matches, decisions: ClusterDecisions, cluster_output: IntArray
 ) -> None:
     """Fill the rows of the 3D detections that took part."""
     table, rows = branches.lidar_table, branches.lidar_index
     table.cluster[rows] = clusters.index
     table.reason[rows] = np.where(clusters.index == SUPPRESSED, Reason.SUPPRESSED, Reason.IN_CLUSTER)
-    own = rows[outcome.box]
-    table.stage[own], table.reason[own] = outcome.stage, outcome.reason
+    own = rows[decisions.box]
+    table.outcome[own], table.reason[own] = decisions.outcome, decisions.reason
     table.camera[own], table.iou[own] = matches.camera, matches.iou
     table.output[own] = cluster_output
-    lasting = outcome.stage != Stage.DROPPED
-    table.score[own[lasting]] = outcome.scores[lasting]
+    lasting = decisions.outcome != Outcome.DROPPED
+    table.score[own[lasting]] = decisions.scores[lasting]
     for c, chosen in enumerate(branches.camera_index):
         here = matches.camera == c
         table.detection[own[here]] = chosen[matches.detection[here]]
@@ -206,7 +208,7 @@ def _write_lidar_rows(
 
 
 def _write_camera_rows(
-    branches: Branches, views: Sequence[View], matches: Matches, outcome: ClusterOutcome, cluster_output: IntArray
+    branches: Branches, views: Sequence[View], matches: Matches, decisions: ClusterDecisions, cluster_output: IntArray
 ) -> None:
     """Fill the rows of the 2D detections that matched a cluster, in their primary camera or in another."""
     table = branches.camera_table
@@ -215,13 +217,13 @@ def _write_camera_rows(
         detection = view.match[cluster]
         rows = start + chosen[detection]
         primary = (matches.camera[cluster] == c) & (matches.detection[cluster] == detection)
-        table.stage[rows] = Stage.MATCHED
+        table.outcome[rows] = Outcome.MATCHED
         table.reason[rows] = np.where(primary, Reason.CONFIRMED, Reason.OTHER_VIEW)
         table.cluster[rows] = cluster
-        table.lidar[rows] = branches.lidar_index[outcome.box[cluster]]
-        table.lidar_score[rows] = branches.lidar.scores[outcome.box[cluster]]
+        table.lidar[rows] = branches.lidar_index[decisions.box[cluster]]
+        table.lidar_score[rows] = branches.lidar.scores[decisions.box[cluster]]
         table.iou[rows] = view.iou[cluster, detection]
-        table.score[rows] = outcome.scores[cluster]
+        table.score[rows] = decisions.scores[cluster]
         table.output[rows] = cluster_output[cluster]
 
 
@@ -240,7 +242,7 @@ def _write_recovery_rows(branches: Branches, recovery: Recovery, outputs: IntArr
     for rows, own, iou in ((first, every, recovery.iou), (second, paired, recovery.second_iou[paired])):
         table.reason[rows], table.iou[rows], table.quality[rows] = recovery.reason[own], iou, recovery.quality[own]
         found = output[own] >= 0
-        table.stage[rows[found]] = Stage.RECOVERED
+        table.outcome[rows[found]] = Outcome.RECOVERED
         table.score[rows[found]], table.output[rows[found]] = recovery.scores[own[found]], output[own[found]]
 
 

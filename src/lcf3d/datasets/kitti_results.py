@@ -1,0 +1,148 @@
+"""Results in KITTI's text form: read as a branch of a run, written beside its provenance."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterator, Sequence
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from lcf3d.errors import ConfigError, DatasetError
+from lcf3d.formats.kitti import (
+    KittiObjects,
+    detections_2d,
+    detections_3d,
+    objects_from_detections,
+    read_folder,
+    write_objects,
+)
+from lcf3d.geometry.camera import project_boxes
+from lcf3d.provenance import FusedDetections
+from lcf3d.structures import Detections2D, Detections3D, FloatArray, Frame
+
+
+class KittiResults:
+    """A folder of KITTI result files, one a frame, read whole so that a bad line stops a run before it starts.
+
+    Args:
+        folder: holds ``ID.txt`` for every frame; a folder written by ``lcf3d run`` (with ``data/``) will do.
+        frame_ids: the dataset's frames.
+        class_names: classes to take; detections of others are left out.
+        missing: ``error`` refuses a folder that lacks frames, ``empty`` takes them as frames without detections.
+    """
+
+    def __init__(
+        self, folder: str | Path, frame_ids: Sequence[str], class_names: Sequence[str], missing: str = "error"
+    ) -> None:
+        path = Path(folder)
+        self.folder = path / "data" if (path / "data").is_dir() else path
+        self.class_names = tuple(class_names)
+        self.missing: Literal["error", "empty"] = "empty" if missing == "empty" else "error"
+        self._frames: dict[str, KittiObjects] = {}
+
+    def load(self, frame_ids: Sequence[str]) -> None:
+        """Read the files of these frames.
+
+        Raises:
+            DatasetError: the folder misses some of them; says how many and which first.
+            FormatError: a line is malformed; names file and line.
+        """
+        frames = read_folder(self.folder, frame_ids, results=True, missing=self.missing)
+        self._frames = dict(zip(frame_ids, frames, strict=True))
+
+    def require_probabilities(self, calibrated: Collection[str]) -> None:
+        """See that the scores that `load` has read lie in [0, 1], but for those of classes that are ``calibrated``.
+
+        Raises:
+            ConfigError: some do not; names the file.
+        """
+        for frame_id, objects in self._frames.items():
+            if objects.scores is None:
+                continue
+            taken = np.isin(objects.class_names, [name for name in self.class_names if name not in calibrated])
+            wrong = np.flatnonzero(taken & ~((objects.scores >= 0) & (objects.scores <= 1)))
+            if len(wrong):
+                score, name = objects.scores[wrong[0]], objects.class_names[wrong[0]]
+                raise ConfigError(
+                    f"{self.folder / frame_id}.txt: scores must lie in [0, 1], got {score:.4g} for a {name}; "
+                    "fit a calibration with 'lcf3d calibrate' and pass --calibration FILE"
+                )
+
+    def objects(self, frame: Frame) -> KittiObjects:
+        """The result lines of one frame, read now unless `load` has read them."""
+        if frame.id not in self._frames:
+            self.load([frame.id])
+        return self._frames[frame.id]
+
+
+class KittiLidarResults(KittiResults):
+    """3D detections of a LiDAR detector."""
+
+    def detect(self, frame: Frame) -> Detections3D:
+        """The detections of one frame in its LiDAR frame.
+
+        Raises:
+            DatasetError: the files hold detections, but none with a 3D box.
+        """
+        objects = self.objects(frame)
+        if len(objects) and not objects.has_box3d.any():
+            raise DatasetError(
+                f"{self.folder / frame.id}.txt holds no 3D boxes: these are 2D results, pass them as the camera branch"
+            )
+        return detections_3d(objects, frame.cameras[0].camera_from_lidar, self.class_names)
+
+
+class KittiCameraResults(KittiResults):
+    """2D detections of a camera detector."""
+
+    def sees(self, frame: Frame, camera: str) -> bool:
+        """Always: a frame without detections was looked at."""
+        return True
+
+    def detect(self, frame: Frame, camera: str) -> Detections2D:
+        """The detections of one frame, clipped to the image of ``camera``."""
+        return detections_2d(self.objects(frame), self.class_names).clipped(frame.camera(camera))
+
+
+class KittiWriter:
+    """Writes ``data/ID.txt``, a KITTI result file, for every frame.
+
+    Args:
+        folder: of the run.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder / "data"
+
+    def write(self, frame: Frame, fused: FusedDetections) -> None:
+        """Write the result file of a frame."""
+        camera_from_lidar = frame.cameras[0].camera_from_lidar
+        objects = objects_from_detections(fused.detections, image_boxes(frame, fused), camera_from_lidar)
+        write_objects(self.folder / f"{frame.id}.txt", objects)
+
+    def is_done(self, frame_id: str) -> bool:
+        """Whether the file of a frame is there."""
+        return (self.folder / f"{frame_id}.txt").is_file()
+
+    def finish(self, frame_ids: Sequence[str], read: Callable[[str], FusedDetections]) -> None:
+        """Nothing belongs to all frames together."""
+
+    def written(self) -> Iterator[Path]:
+        """The files of all frames."""
+        yield from sorted(self.folder.glob("[!.]*.txt"))
+
+
+def image_boxes(frame: Frame, fused: FusedDetections) -> FloatArray:
+    """(N, 4) boxes of the outputs in the frame's first camera.
+
+    The 2D detection where one led to the output, since a detector draws what is visible; else the 3D box's projection,
+    clipped to the image (zeros where it is not in view).
+    """
+    camera = frame.cameras[0]
+    boxes, _ = project_boxes(fused.detections.boxes, camera)
+    if camera.name in fused.camera_names:
+        c = fused.camera_names.index(camera.name)
+        rows = np.flatnonzero((fused.camera.camera == c) & (fused.camera.output >= 0))
+        boxes[fused.camera.output[rows]] = fused.camera_inputs[c].boxes[fused.camera.detection[rows]]
+    return boxes

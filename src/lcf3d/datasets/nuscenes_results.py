@@ -1,0 +1,80 @@
+"""Results in nuScenes' JSON form: read as a branch of a run, written beside its provenance."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+
+from lcf3d.formats.coco import read_camera_detections
+from lcf3d.provenance import FusedDetections
+from lcf3d.structures import Detections2D, Detections3D, Frame
+
+
+class NuscenesLidarResults:
+    """3D detections of a nuScenes submission file.
+
+    Args:
+        frames: by sample token, in canonical LiDAR frames.
+        class_names: classes to take.
+    """
+
+    def __init__(self, frames: Mapping[str, Detections3D], class_names: Sequence[str]) -> None:
+        self._frames = frames
+        self.class_names = tuple(class_names)
+
+    def detect(self, frame: Frame) -> Detections3D:
+        """The detections of one sample in its LiDAR frame."""
+        return self._frames[frame.id].with_classes(self.class_names)
+
+
+class NuscenesCameraResults:
+    """2D detections of a JSON list by sample and camera (see ``lcf3d.formats.coco``), with masks where it has some.
+
+    Args:
+        path: the JSON file.
+        class_names: classes to take.
+
+    Raises:
+        FormatError: not such a list; names the record.
+    """
+
+    def __init__(self, path: str | Path, class_names: Sequence[str]) -> None:
+        self._found = read_camera_detections(Path(path), class_names)
+        self._empty = Detections2D.empty(class_names)
+
+    def sees(self, frame: Frame, camera: str) -> bool:
+        """Always: a camera without detections looked and saw nothing."""
+        return True
+
+    def detect(self, frame: Frame, camera: str) -> Detections2D:
+        """The detections of one camera of one sample, clipped to its image."""
+        return self._found.get((frame.id, camera), self._empty).clipped(frame.camera(camera))
+
+
+class NuscenesWriter:
+    """Writes ``results.json``, one submission of all samples; samples that were not run have no boxes in it.
+
+    Args:
+        folder: of the run.
+        write_results: writes detections by sample token, in canonical LiDAR frames, to a file.
+    """
+
+    def __init__(self, folder: Path, write_results: Callable[[Path, Mapping[str, Detections3D]], None]) -> None:
+        self.path = folder / "results.json"
+        self._write_results = write_results
+
+    def write(self, frame: Frame, fused: FusedDetections) -> None:
+        """Nothing belongs to a single frame."""
+
+    def is_done(self, frame_id: str) -> bool:
+        """Always: nothing belongs to a single frame."""
+        return True
+
+    def finish(self, frame_ids: Sequence[str], read: Callable[[str], FusedDetections]) -> None:
+        """Write the submission."""
+        self._write_results(self.path, {frame_id: read(frame_id).detections for frame_id in frame_ids})
+
+    def written(self) -> Iterator[Path]:
+        """The submission."""
+        if self.path.is_file():
+            yield self.path

@@ -1,0 +1,95 @@
+"""Results as JSON files of our own: read as a branch of a run, written beside its provenance."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+from lcf3d.errors import DatasetError
+from lcf3d.formats.plain import read_detections_2d, read_detections_3d, write_detections_3d
+from lcf3d.provenance import FusedDetections
+from lcf3d.structures import Detections2D, Detections3D, Frame
+
+
+class _PlainResults:
+    """A folder of ``ID.json``; a folder written by ``lcf3d run`` (with ``data/``) will do.
+
+    Args:
+        folder: where the files lie.
+        frame_ids: the dataset's frames.
+        class_names: classes to take.
+        missing: ``error`` refuses a folder that lacks frames, ``empty`` takes them as frames without detections.
+
+    Raises:
+        DatasetError: no such folder, or frames are missing; says how many and which first.
+    """
+
+    def __init__(
+        self, folder: Path | str, frame_ids: Sequence[str], class_names: Sequence[str], missing: str = "error"
+    ) -> None:
+        path = Path(folder)
+        if not path.is_dir():
+            raise DatasetError(f"result folder {path} does not exist")
+        self.folder = path / "data" if (path / "data").is_dir() else path
+        self.class_names = tuple(class_names)
+        absent = [frame_id for frame_id in frame_ids if not self._path(frame_id).is_file()]
+        if absent and (missing == "error" or len(absent) == len(frame_ids)):
+            raise DatasetError(
+                f"{self.folder} lacks the results of {len(absent)} of {len(frame_ids)} frames, first {absent[0]}.json"
+            )
+
+    def _path(self, frame_id: str) -> Path:
+        return self.folder / f"{frame_id}.json"
+
+
+class PlainLidarResults(_PlainResults):
+    """3D detections, see `lcf3d.formats.plain`."""
+
+    def detect(self, frame: Frame) -> Detections3D:
+        """The detections of one frame."""
+        path = self._path(frame.id)
+        if not path.is_file():
+            return Detections3D.empty(self.class_names)
+        return read_detections_3d(path).with_classes(self.class_names)
+
+
+class PlainCameraResults(_PlainResults):
+    """2D detections by camera, see `lcf3d.formats.plain`."""
+
+    def sees(self, frame: Frame, camera: str) -> bool:
+        """Always: a camera without detections looked and saw nothing."""
+        return True
+
+    def detect(self, frame: Frame, camera: str) -> Detections2D:
+        """The detections of one camera of one frame, clipped to its image."""
+        path = self._path(frame.id)
+        found = read_detections_2d(path) if path.is_file() else {}
+        if camera not in found:
+            return Detections2D.empty(self.class_names)
+        return found[camera].with_classes(self.class_names).clipped(frame.camera(camera))
+
+
+class PlainWriter:
+    """Writes ``data/ID.json`` for every frame.
+
+    Args:
+        folder: of the run.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder / "data"
+
+    def write(self, frame: Frame, fused: FusedDetections) -> None:
+        """Write the fused detections of a frame."""
+        write_detections_3d(self.folder / f"{frame.id}.json", fused.detections)
+
+    def is_done(self, frame_id: str) -> bool:
+        """Whether the file of a frame is there."""
+        return (self.folder / f"{frame_id}.json").is_file()
+
+    def finish(self, frame_ids: Sequence[str], read: Callable[[str], FusedDetections]) -> None:
+        """Nothing belongs to all frames together."""
+
+    def written(self) -> Iterator[Path]:
+        """The files of all frames."""
+        yield from sorted(self.folder.glob("[!.]*.json"))
