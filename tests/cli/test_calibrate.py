@@ -31,7 +31,7 @@ def test_calibrate_writes_a_file_and_prints_what_it_brings(drive, tmp_path):
     assert "the camera never detects Cyclist" in text
     calibration = Calibration.load(tmp_path / "c.json")
     assert calibration.camera_classes == ("Car",)
-    assert "24 frames of split val" in calibration.source
+    assert "24 frames, results:" in calibration.source
     values = json.loads(lcf3d(*command, "--folds", 3, "--json").stdout)
     assert [c["class_name"] for c in values["classes"]] == ["Car", "Cyclist"]
     assert values["classes"][0]["after"][1] > values["classes"][0]["before"][1]
@@ -49,8 +49,8 @@ def test_folds_0_leaves_the_report_out(drive, tmp_path):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"--lidar": "onnx:x"}, "results:DIR"),
-        ({"--camera": "results:/nowhere"}, "not a folder"),
+        ({"--lidar": "onnx:x"}, "unknown LiDAR detector kind 'onnx'"),
+        ({"--camera": "results:/nowhere"}, "lacks the files|not a folder|does not exist"),
         ({"--folds": "1"}, "2 folds or more"),
         ({"--folds": "99"}, "24 frames for 99 folds"),
         ({"--split": "night"}, "night"),

@@ -142,8 +142,8 @@ def drop_result(paths):
         (lambda p: None, ("--missing", "ignore"), "error or empty"),
         (lambda p: None, ("--config", "best"), "neither a preset"),
         (lambda p: None, ("--frame", "9"), "has no frame '9'"),
-        (lambda p: None, ("--lidar", "magic:x"), "unknown lidar detector kind"),
-        (lambda p: None, ("--lidar", "results"), "kind:argument"),
+        (lambda p: None, ("--lidar", "magic:x"), "unknown LiDAR detector kind"),
+        (lambda p: None, ("--lidar", "results"), "needs an argument: results:PATH"),
     ],
 )
 def test_bad_input_stops_before_anything_is_written(paths, damage, more, message):
@@ -172,7 +172,8 @@ def test_errors_are_one_sentence_and_exit_code_2(capsys, monkeypatch):
     with pytest.raises(SystemExit) as stop:
         main()
     assert stop.value.code == 2
-    assert capsys.readouterr().err == ("error: 'nonsense' is neither a preset (paper, kitti, nuscenes) nor a file\n")
+    names = "default, paper, kitti, nuscenes"
+    assert capsys.readouterr().err == f"error: 'nonsense' is neither a preset ({names}) nor a file\n"
 
 
 def test_config_prints_and_writes(tmp_path):
@@ -244,6 +245,6 @@ def test_the_localizer_can_be_chosen(paths, tmp_path):
     assert [len(b) for b in boxes] == [1, 1, 1]
     assert np.abs(boxes[0] - boxes[1]).max() > 1e-6
     np.testing.assert_allclose(boxes[1], boxes[2], atol=1e-5)
-    with pytest.raises(Lcf3dError, match="unknown localizer 'best'"):
+    with pytest.raises(Lcf3dError, match="unknown localizer kind 'best'"):
         run({**paths, "out": tmp_path / "none"}, "--localizer", "best")
     assert not (tmp_path / "none").exists()

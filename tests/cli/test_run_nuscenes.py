@@ -393,7 +393,7 @@ def test_fusion_improves_centerpoint_on_mini_val(shared: Path, tmp_path: Path) -
     scores = {}
     for path in (lidar, tmp_path / "out/results.json"):
         printed = CliRunner().invoke(app, ["eval", f"nuscenes:{root}", str(path), "--split", "mini_val", "--json"])
-        scores[path.name] = json.loads(printed.stdout)
+        scores[path.name] = json.loads(printed.stdout)["results"][0]["metrics"]
     alone, fused = scores["centerpoint.json"], scores["results.json"]
     assert fused["mean_ap"] > alone["mean_ap"] + 0.03
     # without velocity and attributes, which CenterPoint's file does not hold

@@ -133,14 +133,14 @@ def test_bad_requests(kitti: Path, run_folder: Path, tmp_path: Path) -> None:
         with pytest.raises(ConfigError, match=message):
             view(*arguments)
     (tmp_path / "empty").mkdir()
-    with pytest.raises(DatasetError, match=r"000001\.txt does not exist"):
+    with pytest.raises(DatasetError, match=r"lacks the files of 1 of 1 frames, first 000001\.txt"):
         view(source, "--frame", "000001", "--results", tmp_path / "empty")
     assert not (tmp_path / "000001.png").exists()
 
 
 def test_a_run_whose_dataset_has_moved(run_folder: Path, kitti: Path) -> None:
     kitti.rename(kitti.with_name("moved"))
-    with pytest.raises(ConfigError, match=r"the dataset of this run is not there .* lcf3d view kitti:ROOT --results"):
+    with pytest.raises(ConfigError, match=r"the dataset of this run is not there .* lcf3d view kind:ROOT --results"):
         view(run_folder)
     (run_folder / "run.json").write_text(json.dumps({"lcf3d": "0.1.0"}))
     with pytest.raises(ConfigError, match="does not say what dataset was run"):

@@ -75,8 +75,8 @@ def test_malformed_calibration(tmp_path, change, message):
 
 def test_missing_calibration_is_found_before_any_work(root):
     (root / "training" / "calib" / "000001.txt").unlink()
+    data = KittiDataset(root, "val")
     with pytest.raises(Lcf3dError, match=r"lacks 1 of 3 frames, first 000001.txt"):
-        data = KittiDataset(root, "val")
         data.require_complete(data.ids)
 
 

@@ -136,7 +136,7 @@ def test_results_of_other_samples(world: Path, tmp_path: Path) -> None:
         dataset.write_results(path, {"other": Detections3D.empty(NUSCENES_CLASSES)})
     path.write_text('{"meta": {}, "results": {"s0": []}}')
     with pytest.raises(FormatError, match="lacks 2 of 3 samples, the first is s1"):
-        dataset.read_results(path)
+        dataset.lidar_results(path, NUSCENES_CLASSES).load(dataset.ids)
 
 
 @pytest.mark.parametrize(("seconds", "known"), [(1.4, True), (1.6, False)])

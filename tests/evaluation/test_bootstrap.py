@@ -56,8 +56,8 @@ def test_a_resample_is_the_evaluation_of_the_drawn_frames() -> None:
 
 def test_comparison_of_a_result_with_itself_is_certain() -> None:
     rows = compare(evaluator(0, 0.7), evaluator(0, 0.7), samples=50)
-    assert {(row.measure, row.difficulty) for row in rows} == {
-        (measure, difficulty) for measure in ("bbox", "aos", "bev", "3d") for difficulty in ("easy", "moderate", "hard")
+    assert {(row.measure, row.level) for row in rows} == {
+        (measure, difficulty) for measure in ("2D", "AOS", "BEV", "3D") for difficulty in ("easy", "moderate", "hard")
     }
     for row in rows:
         assert (row.difference.value, row.difference.low, row.difference.high) == (0, 0, 0)
@@ -66,7 +66,7 @@ def test_comparison_of_a_result_with_itself_is_certain() -> None:
 
 def test_a_clear_difference_leaves_out_zero() -> None:
     first, second = evaluator(0, 0.3), evaluator(1, 0.95)
-    row = next(r for r in compare(first, second, samples=200) if (r.measure, r.difficulty) == ("bbox", "moderate"))
+    row = next(r for r in compare(first, second, samples=200) if (r.measure, r.level) == ("2D", "moderate"))
     assert row.first.value == first.metrics().ap("Car", "bbox")
     assert row.second.value == second.metrics().ap("Car", "bbox")
     assert row.difference.value == pytest.approx(row.second.value - row.first.value)

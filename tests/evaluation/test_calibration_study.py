@@ -90,8 +90,8 @@ def test_results_without_3d_boxes_are_refused(study):
 )
 def test_the_default_never_loses(shared, folder, lidar, camera, folds, gains):
     root = shared / "data" / folder
-    branches = [f"results:{root / 'results' / name}" for name in (lidar, camera)]
-    real = open_study(f"kitti:{root}", "val", *branches, CONFIG, folds=folds, quiet=True)
+    lidar, camera = (f"results:{root / 'results' / name}" for name in (lidar, camera))
+    real = open_study(RunRequest(f"kitti:{root}", lidar, {"*": camera}, "val"), folds)
     reports = {r.class_name: r for r in real.cross_validate(real.fit())}
     assert set(reports) == set(gains)
     for name, least in gains.items():

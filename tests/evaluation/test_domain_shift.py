@@ -313,7 +313,9 @@ def test_a_detector_of_the_other_data_gets_adapted_points(folders: dict[str, Pat
     monkeypatch.setitem(sys.modules, "my_lidar", type(sys)("my_lidar"))
     sys.modules["my_lidar"].Build = build
     point = EntryPoint("mine", "my_lidar:Build", "lcf3d.lidar_detectors")
-    monkeypatch.setattr(plugins, "_points", lambda group: {"mine": point})
+    installed = plugins._points
+    lidar = {"mine": point}
+    monkeypatch.setattr(plugins, "_points", lambda g: lidar if g == point.group else installed(g))
     task = parse_task(f"nuscenes->kitti kitti:{folders['kitti']} lidar=mine:x split=val")
     result = DomainTaskRunner(task, FusionConfig())()
     raw = KittiDataset(folders["kitti"], "val")[0].points

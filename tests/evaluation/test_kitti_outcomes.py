@@ -3,11 +3,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from lcf3d.evaluation.kitti_fates import fates, fusion_fates, read_provenance
 
 from lcf3d.errors import FormatError
 from lcf3d.evaluation.kitti import KittiEvaluator, Selection
-from lcf3d.evaluation.kitti_study import study, worst_frames
+from lcf3d.evaluation.kitti_outcomes import fusion_outcomes, read_provenance, working_point
+from lcf3d.evaluation.kitti_study import study
 from lcf3d.geometry.boxes import lidar_from_kitti
 from lcf3d.provenance import Decisions, FusedDetections, Outcome, Reason
 from lcf3d.structures import Detections3D
@@ -45,19 +45,19 @@ def fusion() -> tuple[list[dict[str, object]], list[dict[str, object]], FusedDet
     return truth, output, fused
 
 
-def test_fates_at_a_threshold() -> None:
+def test_outcomes_at_a_threshold() -> None:
     truth, output, _ = fusion()
     evaluator = KittiEvaluator(frames([truth], False), frames([output], True))
-    assert fates(evaluator, MODERATE, 0.0).counts == {"true_positives": 2, "false_positives": 1, "misses": 2}
-    assert fates(evaluator, MODERATE, 0.8).counts == {"true_positives": 1, "false_positives": 0, "misses": 3}
+    assert working_point(evaluator, MODERATE, 0.0).counts == {"true_positives": 2, "false_positives": 1, "misses": 2}
+    assert working_point(evaluator, MODERATE, 0.8).counts == {"true_positives": 1, "false_positives": 0, "misses": 3}
 
 
-def test_fates_split_by_what_the_fusion_did() -> None:
+def test_outcomes_split_by_what_the_fusion_did() -> None:
     truth, output, fused = fusion()
     evaluator = KittiEvaluator(frames([truth], False), frames([output], True))
-    split = fusion_fates(evaluator, {"0": fused}, {"0": CAMERA_FROM_LIDAR}, MODERATE)
+    split = fusion_outcomes(evaluator, {"0": fused}, {"0": CAMERA_FROM_LIDAR}, MODERATE)
     # the best F1 is that of all three: 2 of 3 right, 2 of 4 found
-    assert split.threshold == 0.6
+    assert working_point(evaluator, MODERATE).threshold == 0.6
     assert split.true_positives == {"matched": 1, "recovered": 1}
     assert split.false_positives == {"downweighted": 1}
     assert split.dropped_wrongly == {"unconfirmed": 1}
@@ -70,7 +70,7 @@ def test_fates_split_by_what_the_fusion_did() -> None:
 def test_a_line_that_the_writer_left_out_shifts_nothing() -> None:
     truth, output, fused = fusion()
     evaluator = KittiEvaluator(frames([truth], False), frames([output[1:]], True))
-    split = fusion_fates(evaluator, {"0": fused}, {"0": CAMERA_FROM_LIDAR}, MODERATE)
+    split = fusion_outcomes(evaluator, {"0": fused}, {"0": CAMERA_FROM_LIDAR}, MODERATE)
     assert split.true_positives == {"recovered": 1}
     assert split.false_positives == {"downweighted": 1}
 
@@ -78,7 +78,7 @@ def test_a_line_that_the_writer_left_out_shifts_nothing() -> None:
 def test_frames_without_provenance_are_unknown() -> None:
     truth, output, _ = fusion()
     evaluator = KittiEvaluator(frames([truth], False), frames([output], True))
-    split = fusion_fates(evaluator, {}, {}, MODERATE)
+    split = fusion_outcomes(evaluator, {}, {}, MODERATE)
     assert split.true_positives == {"unknown": 2}
     assert split.dropped_wrongly == {}
     assert split.misses == {"dropped": 0, "below_threshold": 0, "not_proposed": 2}
@@ -99,6 +99,7 @@ def test_provenance_is_read_where_there_is_some(tmp_path: Path) -> None:
 def test_worst_frames_come_first() -> None:
     truth = [[car(0)], [car(0), car(5)], [car(0)]]
     results = [[car(0)], [car(10), car(20)], [car(30), car(0)]]
-    one = study(KittiEvaluator(frames(truth, False), frames(results, True)), "x")
-    assert worst_frames(one, 5) == [(1, 2, 2), (2, 1, 0)]
-    assert worst_frames(one, 1) == [(1, 2, 2)]
+    evaluator = KittiEvaluator(frames(truth, False), frames(results, True))
+    one = study(evaluator, "x", {}, {}, lambda _: CAMERA_FROM_LIDAR)
+    assert [(f, one.wrong[f], one.missed[f]) for f in one.worst_frames(5)] == [(1, 2, 2), (2, 1, 0)]
+    assert one.worst_frames(1) == [1]

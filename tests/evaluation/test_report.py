@@ -3,17 +3,19 @@ from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
-from lcf3d.evaluation.kitti_fates import FusionFates, fusion_fates
-from lcf3d.evaluation.kitti_pictures import footprints, worst_frame_pictures
-from PIL import Image
 
-from lcf3d.evaluation.kitti import KittiEvaluator, Selection
+from lcf3d.datasets.kitti import KittiCalibration
+from lcf3d.evaluation.kitti import KittiEvaluator
 from lcf3d.evaluation.kitti_breakdown import compare
-from lcf3d.evaluation.kitti_study import ClassStudy, KittiStudy, study
+from lcf3d.evaluation.kitti_study import study
+from lcf3d.evaluation.kitti_task import KittiResultSet
+from lcf3d.evaluation.pictures import footprint, worst_frame_pictures
 from lcf3d.evaluation.report import html_report
+from lcf3d.evaluation.study import ClassStudy, FusionOutcomes, Study
 from lcf3d.evaluation.svg import Line, Shape, bev_scene, image_scene, line_chart
+from lcf3d.structures import Camera, Frame
 
-from .kitti_frames import frames, objects
+from .kitti_frames import frames
 
 
 class Balanced(HTMLParser):
@@ -45,14 +47,33 @@ def parsed(html: str) -> Balanced:
     return parser
 
 
-def example(name: str = "run", shift: float = 0.0) -> KittiStudy:
+TRANSFORM = np.array([[0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1.0]])
+
+
+class Calibrated:
+    """What the evaluation asks of a dataset."""
+
+    def calibration(self, frame_id: str) -> KittiCalibration:
+        return KittiCalibration({}, TRANSFORM)
+
+    def frame(self, frame_id: str) -> Frame:
+        image = {"left": np.full((40, 120, 3), 90, np.uint8)} if frame_id == "3" else {}
+        view = Camera("left", np.eye(3, 4), TRANSFORM, 120, 40)
+        return Frame(frame_id, cameras=[view], images=image)
+
+
+def result_set(name: str = "run", shift: float = 0.0) -> KittiResultSet:
     truth = frames([[{"location": (0, 1.5, 10 + i)}, {"location": (6, 1.5, 10)}] for i in range(45)], False)
     rows = [[{"location": (shift, 1.5, 10 + i), "score": 1 - i / 100}] for i in range(45)]
-    return study(KittiEvaluator(truth, frames(rows, True)), name)
+    return KittiResultSet(name, Path("nowhere"), KittiEvaluator(truth, frames(rows, True)), Calibrated(), ())
+
+
+def page(*sets: KittiResultSet, title: str = "t", **more) -> str:
+    return html_report(title, [one.study() for one in sets], [one.tables() for one in sets], **more)
 
 
 def test_report_is_one_whole_page_without_outside_addresses() -> None:
-    html = html_report("A & B", [example("<run>")], pictures={"7: 1 wrong": "<p>x</p>"})
+    html = page(result_set("<run>"), title="A & B", pictures={"7: 1 wrong": "<p>x</p>"})
     parser = parsed(html)
     assert parser.addresses == []
     assert "A &amp; B" in html
@@ -62,19 +83,18 @@ def test_report_is_one_whole_page_without_outside_addresses() -> None:
 
 
 def test_report_shows_the_numbers_of_the_metrics() -> None:
-    one = example()
-    html = html_report("t", [one])
+    one = result_set()
+    html = page(one)
     assert f"<td>{one.metrics.ap('Car', '3d', 'moderate'):.2f}</td>" in html
-    assert "Objects that count, easy / moderate / hard: Car 90 / 90 / 90" in html
     assert "0 to 20 m" in html
     # 45 objects found, the other 45 missed, nothing wrong
     assert "<td>45</td><td>0</td><td>45</td><td>1.000</td><td>0.500</td>" in html
 
 
 def test_two_results_are_compared_in_the_report() -> None:
-    first, second = example("a", shift=3.0), example("b")
+    first, second = result_set("a", shift=3.0), result_set("b")
     rows = compare(first.evaluator, second.evaluator, samples=20)
-    html = html_report("t", [first, second], rows)
+    html = page(first, second, comparison=rows)
     parsed(html)
     assert "Side by side" in html
     assert "<span class='good'>" in html
@@ -84,11 +104,9 @@ def test_two_results_are_compared_in_the_report() -> None:
 
 
 def test_what_the_fusion_did_is_shown_by_reason() -> None:
-    one = example()
+    one = result_set().study()
     part = one.classes[0]
-    fused = FusionFates(
-        "Car",
-        0.5,
+    fused = FusionOutcomes(
         {"matched": 31},
         {"downweighted": 3},
         {"unconfirmed": 7},
@@ -96,31 +114,28 @@ def test_what_the_fusion_did_is_shown_by_reason() -> None:
         {"dropped": 7, "below_threshold": 2, "not_proposed": 36},
     )
     changed = ClassStudy(**{**part.__dict__, "fusion": fused})
-    html = html_report("t", [KittiStudy(one.name, one.evaluator, one.metrics, (changed,))])
+    html = html_report("t", [Study(**{**one.__dict__, "classes": (changed,)})], [[]])
     parsed(html)
     assert "<th>matched</th><th>downweighted</th>" in html
     assert "<td>right</td><td>31</td><td>0</td>" in html
     assert "<td>unconfirmed</td><td>19</td><td>7</td>" in html
     assert "<td>low score</td><td>5</td><td>0</td>" in html
     assert "<td>7</td><td>2</td><td>36</td>" in html
-    assert fusion_fates(one.evaluator, {}, {}, Selection("Car", "3d", "moderate")).threshold == part.fates.threshold
 
 
-def test_results_without_3d_boxes_have_a_report_too(tmp_path: Path) -> None:
+def test_results_without_3d_boxes_have_a_report_too() -> None:
     flat = {"size": (-1, -1, -1), "location": (-1000, -1000, -1000), "alpha": -10}
     rows = [[{**flat, "score": 1 - i / 100}] for i in range(45)]
-    one = study(KittiEvaluator(frames([[]] + [[{}]] * 44, False), frames(rows, True)), "2d")
-    html = html_report("t", [one], pictures=worst_frame_pictures(one, tmp_path))
+    evaluator = KittiEvaluator(frames([[]] + [[{}]] * 44, False), frames(rows, True))
+    one = study(evaluator, "2d", {}, {}, lambda _: TRANSFORM)
+    html = html_report("t", [one], [[]], pictures=worst_frame_pictures(one, Calibrated()))
     parsed(html)
     assert "By distance" not in html
     assert "0: 1 wrong, 0 missed" in html
 
 
-def test_pictures_of_the_worst_frames_are_embedded(tmp_path: Path) -> None:
-    folder = tmp_path / "training" / "image_2"
-    folder.mkdir(parents=True)
-    Image.fromarray(np.full((40, 120, 3), 90, np.uint8)).save(folder / "3.png")
-    pictures = worst_frame_pictures(example(), tmp_path, count=5)
+def test_pictures_of_the_worst_frames_are_embedded() -> None:
+    pictures = worst_frame_pictures(result_set().study(), Calibrated(), count=5)
     assert len(pictures) == 5
     with_image = [body for heading, body in pictures.items() if heading.startswith("3:")]
     assert len(with_image) == 1
@@ -131,12 +146,12 @@ def test_pictures_of_the_worst_frames_are_embedded(tmp_path: Path) -> None:
         assert "Car, missed" in body  # the title of the object that nothing found
 
 
-def test_footprint_turns_clockwise_seen_from_above() -> None:
-    ahead = objects([{"rotation": -np.pi / 2, "location": (1, 0, 20), "size": (1.5, 2, 4)}], True)
-    # heading forward: front at z = 22, left front first
-    np.testing.assert_allclose(footprints(ahead)[0], [[0, 22], [2, 22], [2, 18], [0, 18]], atol=1e-12)
-    right = objects([{"rotation": 0.0, "location": (1, 0, 20), "size": (1.5, 2, 4)}], True)
-    np.testing.assert_allclose(footprints(right)[0], [[3, 21], [3, 19], [-1, 19], [-1, 21]], atol=1e-12)
+def test_footprint_has_metres_right_and_forward_with_the_front_first() -> None:
+    ahead = np.array([20.0, -1, 0, 4, 2, 1.5, 0.0])
+    np.testing.assert_allclose(footprint(ahead), [[0, 22], [2, 22], [2, 18], [0, 18]], atol=1e-12)
+    # heading to the left: the front lies to the left
+    left = np.array([20.0, -1, 0, 4, 2, 1.5, np.pi / 2])
+    np.testing.assert_allclose(footprint(left), [[-1, 19], [-1, 21], [3, 21], [3, 19]], atol=1e-12)
 
 
 def test_chart_puts_values_where_the_axes_say() -> None:

@@ -24,7 +24,7 @@ def scene(shared):
     frame = KittiDataset(shared / "data/kitti", "stereo").frame("000107")
     detector = OnnxDetector(shared / "weights/yolox_nano.onnx", tiles=2)
     found = {name: detector([frame.images[name]])[0] for name in ("left", "right")}
-    cars = KittiLidarResults(shared / "data/kitti/results/point_gnn", [frame.id], KITTI_CLASSES).detect(frame)
+    cars = KittiLidarResults(shared / "data/kitti/results/point_gnn", KITTI_CLASSES).detect(frame)
     squashed = 1 / (1 + np.exp(-(cars.scores - 20) / 10))
     return frame, Detections3D(cars.boxes, squashed, cars.labels, cars.class_names), found
 

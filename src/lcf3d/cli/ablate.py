@@ -19,7 +19,7 @@ def ablate(
     dataset: Annotated[str, typer.Argument(help="kitti:ROOT, nuscenes:ROOT or another installed kind, with labels")],
     lidar: Annotated[str, typer.Option(help="LiDAR detector, kind:argument, for example results:DIR")],
     camera: Annotated[str, typer.Option(help="camera detector, kind:argument, for example results:DIR or onnx:FILE")],
-    split: Annotated[str | None, typer.Option(help="split of the dataset; all frames if left out")] = None,
+    split: Annotated[str | None, typer.Option(help="split of the dataset; the usual one if left out")] = None,
     tables: Annotated[str | None, typer.Option(help="nuScenes: folder of tables; the only one if left out")] = None,
     calibration: Annotated[
         str, typer.Option(help="score calibration: a file of 'lcf3d calibrate', auto, or none")
@@ -47,7 +47,7 @@ def ablate(
 
     from lcf3d.cli.console import plain, print_table, tracked
     from lcf3d.evaluation.ablation import ablate as measure
-    from lcf3d.evaluation.protocol import open_evaluation
+    from lcf3d.evaluation.protocol import open_evaluation, usual_frames
     from lcf3d.fusion.calibration import load_calibration
     from lcf3d.fusion.self_calibration import self_calibrate
     from lcf3d.run.setup import RunRequest, read_inputs
@@ -65,7 +65,7 @@ def ablate(
         tiles=tiles,
         missing=missing,
     )
-    found = read_inputs(request)
+    found = read_inputs(request, usual_frames)
     evaluation = open_evaluation(found.dataset, found.frame_ids)
     inputs = detections_of(found)
     scores = self_calibrate(inputs, found.config) if calibration == "auto" else load_calibration(calibration)

@@ -19,7 +19,7 @@ def calibrate(
     lidar: Annotated[str, typer.Option(help="LiDAR detector, kind:argument, best results:PATH")],
     camera: Annotated[str, typer.Option(help="camera detector, kind:argument, best results:PATH")],
     out: Annotated[Path, typer.Option(help="calibration file to write")] = Path("calibration.json"),
-    split: Annotated[str | None, typer.Option(help="split of the dataset; all frames if left out")] = None,
+    split: Annotated[str | None, typer.Option(help="split of the dataset; the usual one if left out")] = None,
     tables: Annotated[str | None, typer.Option(help="nuScenes: folder of tables; the only one if left out")] = None,
     folds: Annotated[int, typer.Option(help="parts of the cross-validation; 0 to leave it out")] = 5,
     config: Annotated[

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -29,12 +30,15 @@ def check(
 
     from rich.progress import Progress
 
-    from lcf3d.datasets.opening import open_dataset
+    from lcf3d.datasets.opening import check_dataset
 
-    data = open_dataset(dataset, split=split, version=tables)
     with Progress(disable=json_) as progress:
-        task = progress.add_task("checking", total=len(data))
-        findings = data.check(results, lambda: progress.advance(task))
+
+        def begin(frames: int) -> Callable[[], None]:
+            task = progress.add_task("checking", total=frames)
+            return lambda: progress.advance(task)
+
+        findings = check_dataset(dataset, results, begin, split=split, version=tables)
     if json_:
         typer.echo(json.dumps([asdict(finding) for finding in findings], indent=2))
     else:

@@ -13,6 +13,7 @@ from lcf3d.errors import ConfigError
 if TYPE_CHECKING:
     from lcf3d.datasets.base import Dataset
     from lcf3d.evaluation.protocol import ComparisonRow, ResultSet, TableData
+    from lcf3d.evaluation.study import Study
 
 
 def eval(
@@ -60,11 +61,12 @@ def eval(
     names = result_names(results)
     sets = [evaluation.read(path.expanduser(), name, missing) for path, name in zip(results, names, strict=True)]
     rows = evaluation.compare(sets[0], sets[1], samples, seed) if compare else []
-    content: dict[str, Any] = {"results": [{"results": one.name, "metrics": one.to_json()} for one in sets]}
+    studies = [one.study() for one in sets] if json_ or out is not None else []
+    content: dict[str, Any] = {"results": [study.to_json() for study in studies]}
     if compare:
         content["comparison"] = {"samples": samples, "seed": seed, "rows": [_row_json(row) for row in rows]}
     if out is not None:
-        _write(data, sets, rows, content, out, worst)
+        _write(data, sets, studies, rows, content, out, worst)
     if json_:
         typer.echo(json.dumps(content, indent=2))
         return
@@ -89,7 +91,7 @@ def _frames_of_run(results: Path, split: str | None) -> tuple[str | None, tuple[
     from lcf3d.run.folder import RunFolder
 
     folder = run_folder(results)
-    if split is not None or not RunFolder.is_run(folder):
+    if split is not None or not (folder / "run.json").is_file():
         return split, None, False
     request = RunFolder(folder).request()
     frames = tuple(str(frame_id) for frame_id in request.get("frames") or ())
@@ -111,7 +113,9 @@ def result_names(results: Sequence[Path]) -> list[str]:
 
 def _row_json(row: ComparisonRow) -> dict[str, Any]:
     """Plain JSON values of a row of a comparison."""
-    intervals = {name: getattr(row, name)._asdict() for name in ("first", "second", "difference")}
+    from dataclasses import asdict
+
+    intervals = {name: asdict(getattr(row, name)) for name in ("first", "second", "difference")}
     return {"class_name": row.class_name, "measure": row.measure, "difficulty": row.level, **intervals}
 
 
@@ -140,6 +144,7 @@ def comparison_table(rows: Sequence[ComparisonRow], names: Sequence[str], sample
 def _write(
     data: Dataset,
     sets: Sequence[ResultSet],
+    studies: Sequence[Study],
     rows: Sequence[ComparisonRow],
     content: dict[str, Any],
     out: Path,
@@ -150,10 +155,8 @@ def _write(
     from lcf3d.evaluation.report import html_report
     from lcf3d.files import write_json, write_text
 
-    studies = [one.study() for one in sets]
     pictures = worst_frame_pictures(studies[-1], data, worst)
-    looked = [{**known, **study.to_json()} for known, study in zip(content["results"], studies, strict=True)]
-    write_json(out / "metrics.json", {**content, "results": looked})
+    write_json(out / "metrics.json", content)
     title = f"{studies[0].heading}: {' and '.join(study.name for study in studies)}"
     write_text(out / "report.html", html_report(title, studies, [one.tables() for one in sets], rows, pictures))
     details = getattr(sets[-1], "details_json", None)

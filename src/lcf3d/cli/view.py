@@ -50,7 +50,7 @@ def view(
     dataset = _open_run(run_folder) if run_folder else open_dataset(source)
     shown = run_folder or results
     ids = _frame_ids(dataset, frame or [], shown, limit)
-    scene_of = _scenes(dataset, shown, truth, min_score)
+    scene_of = _scenes(dataset, shown, truth, min_score, ids[0])
     paths = _paths(ids, out, run_folder)
     with Progress(disable=len(ids) < 2) as progress:
         for frame_id in progress.track(ids, description="drawing"):
@@ -104,7 +104,9 @@ def _frame_ids(dataset: Dataset, chosen: Sequence[str], shown: Path | None, limi
     return list(require_frames(dataset, chosen, "the dataset"))[:limit]
 
 
-def _scenes(dataset: Dataset, shown: Path | None, truth: bool, min_score: float) -> Callable[[Frame], Scene]:
+def _scenes(
+    dataset: Dataset, shown: Path | None, truth: bool, min_score: float, first: str
+) -> Callable[[Frame], Scene]:
     """What to draw over a frame."""
     from lcf3d.run.folder import RunFolder
     from lcf3d.structures import Detections3D
@@ -117,7 +119,7 @@ def _scenes(dataset: Dataset, shown: Path | None, truth: bool, min_score: float)
     if RunFolder.is_run(shown):
         folder = RunFolder(shown)
         return lambda frame: Scene.from_fused(folder.read(frame.id), frame.labels if truth else None, min_score)
-    boxes, flat = _result_readers(dataset, shown)
+    boxes, flat = _result_readers(dataset, shown, first)
 
     def scene(frame: Frame) -> Scene:
         found = boxes.detect(frame) if boxes is not None else Detections3D.empty(dataset.class_names)
@@ -127,14 +129,16 @@ def _scenes(dataset: Dataset, shown: Path | None, truth: bool, min_score: float)
     return scene
 
 
-def _result_readers(dataset: Dataset, path: Path) -> tuple[LidarSource | None, CameraSource | None]:
+def _result_readers(dataset: Dataset, path: Path, first: str) -> tuple[LidarSource | None, CameraSource | None]:
     """Result files as 3D detections, or as 2D detections where they hold no 3D boxes."""
     try:
-        lidar = dataset.lidar_results(path, dataset.class_names, "empty")
-        lidar.detect(dataset.frame(dataset.ids[0]))
+        lidar = dataset.lidar_results(path, dataset.class_names)
+        lidar.detect(dataset.frame(first))
         return lidar, None
-    except DatasetError:
-        return None, dataset.camera_results(path, dataset.class_names, "empty")
+    except DatasetError as error:
+        if "no 3D boxes" not in str(error):
+            raise
+        return None, dataset.camera_results(path, dataset.class_names)
 
 
 def _paths(ids: Sequence[str], out: Path | None, run_folder: Path | None) -> dict[str, Path]:

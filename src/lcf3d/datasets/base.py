@@ -157,13 +157,13 @@ class BaseDataset(Sequence[Frame]):
         """3D detections in JSON files of our own."""
         from lcf3d.datasets.plain_results import PlainLidarResults
 
-        return PlainLidarResults(path, self.ids, class_names, missing)
+        return PlainLidarResults(path, class_names, missing)
 
     def camera_results(self, path: Path, class_names: Sequence[str], missing: str = "error") -> CameraSource:
         """2D detections in JSON files of our own."""
         from lcf3d.datasets.plain_results import PlainCameraResults
 
-        return PlainCameraResults(path, self.ids, class_names, missing)
+        return PlainCameraResults(path, class_names, missing)
 
     def writer(self, folder: Path) -> ResultWriter:
         """One JSON file a frame."""
@@ -183,7 +183,7 @@ def require_missing(missing: str) -> str:
         ConfigError: it is not.
     """
     if missing not in MISSING:
-        raise ConfigError(f"missing results are taken as error or empty, got {missing!r}")
+        raise ConfigError(f"--missing takes error or empty, got {missing!r}")
     return missing
 
 

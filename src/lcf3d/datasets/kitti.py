@@ -155,11 +155,15 @@ class KittiDataset(BaseDataset):
         self.class_names = tuple(class_names)
         self.default_image_size = image_size
         self.split = split
-        listed = () if split is None else read_frame_ids(self._split_path(split))
-        self.folder = self.root / (part or self._part_of(listed))
+        self._listed = () if split is None else read_frame_ids(self._split_path(split))
+        self.folder = self.root / (part or self._part_of(self._listed))
         if not self.folder.is_dir():
             raise DatasetError(f"{self.root} has no folder {self.folder.name!r}; expected the KITTI object layout")
-        self.ids = self._all_ids() if split is None else listed
+
+    @cached_property
+    def ids(self) -> tuple[str, ...]:  # type: ignore[override]
+        """The frames of the split; without one, all that have a calibration."""
+        return self._all_ids() if self.split is None else self._listed
 
     @staticmethod
     def recognizes(root: Path) -> bool:
@@ -223,16 +227,16 @@ class KittiDataset(BaseDataset):
         return camera in self.image_paths(frame_id)
 
     def lidar_results(self, path: Path, class_names: Sequence[str], missing: str = "error") -> LidarSource:
-        """3D detections of KITTI result files, all read now."""
+        """3D detections of KITTI result files."""
         from lcf3d.datasets.kitti_results import KittiLidarResults
 
-        return KittiLidarResults(path, self.ids, class_names, missing)
+        return KittiLidarResults(path, class_names, missing)
 
     def camera_results(self, path: Path, class_names: Sequence[str], missing: str = "error") -> CameraSource:
-        """2D detections of KITTI result files, all read now."""
+        """2D detections of KITTI result files."""
         from lcf3d.datasets.kitti_results import KittiCameraResults
 
-        return KittiCameraResults(path, self.ids, class_names, missing)
+        return KittiCameraResults(path, class_names, missing)
 
     def writer(self, folder: Path) -> ResultWriter:
         """A KITTI result file a frame."""

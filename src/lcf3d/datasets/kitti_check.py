@@ -41,7 +41,11 @@ LEAST_IOU = 0.3
 class KittiFrames(Protocol):
     """What the rules ask of a KITTI dataset."""
 
-    ids: tuple[str, ...]
+    @property
+    def ids(self) -> tuple[str, ...]:
+        """The frames."""
+        ...
+
     folder: Path
 
     def __len__(self) -> int: ...

@@ -27,14 +27,11 @@ class KittiResults:
 
     Args:
         folder: holds ``ID.txt`` for every frame; a folder written by ``lcf3d run`` (with ``data/``) will do.
-        frame_ids: the dataset's frames.
         class_names: classes to take; detections of others are left out.
         missing: ``error`` refuses a folder that lacks frames, ``empty`` takes them as frames without detections.
     """
 
-    def __init__(
-        self, folder: str | Path, frame_ids: Sequence[str], class_names: Sequence[str], missing: str = "error"
-    ) -> None:
+    def __init__(self, folder: str | Path, class_names: Sequence[str], missing: str = "error") -> None:
         path = Path(folder)
         self.folder = path / "data" if (path / "data").is_dir() else path
         self.class_names = tuple(class_names)

@@ -171,7 +171,8 @@ class NuscenesDataset(BaseDataset):
         """3D detections of a submission, or of a run folder."""
         from lcf3d.datasets.nuscenes_results import NuscenesLidarResults
 
-        return NuscenesLidarResults(self.read_results(result_file(path), missing), class_names)
+        file = result_file(path)
+        return NuscenesLidarResults(file, self.read_results(file), class_names, missing)
 
     def camera_results(self, path: Path, class_names: Sequence[str], missing: str = "error") -> CameraSource:
         """2D detections of a list by sample and camera (`lcf3d.formats.coco`)."""
@@ -184,6 +185,13 @@ class NuscenesDataset(BaseDataset):
         from lcf3d.datasets.nuscenes_results import NuscenesWriter
 
         return NuscenesWriter(folder, self.write_results)
+
+    @staticmethod
+    def check_unreadable(root: str, version: str | None = None) -> list[Finding]:
+        """What is wrong with tables that cannot be opened."""
+        from lcf3d.datasets.nuscenes_check import check_nuscenes
+
+        return check_nuscenes(Path(root).expanduser(), version)
 
     def check(self, results: Path | None = None, progress: Callable[[], None] = lambda: None) -> list[Finding]:
         """The rules ``NUS``."""
@@ -261,26 +269,16 @@ class NuscenesDataset(BaseDataset):
             if row >= 0
         }
 
-    def read_results(self, path: Path, missing: str = "error") -> dict[str, Detections3D]:
+    def read_results(self, path: Path) -> dict[str, Detections3D]:
         """Detections of a submission file by sample token, each in its sample's canonical LiDAR frame.
 
-        Samples outside this dataset are left out; with ``missing="empty"`` those that it lacks have no detections.
+        Samples outside this dataset are left out.
 
         Raises:
-            FormatError: not a submission (`read_submission`), or samples of this dataset are missing in it.
+            FormatError: not a submission (`read_submission`).
         """
         boxes = split_by_sample(read_submission(path)[0])
-        absent = [token for token in self.ids if token not in boxes]
-        if absent and (missing == "error" or len(absent) == len(self)):
-            raise FormatError(
-                f"{path} lacks {len(absent)} of {len(self)} samples, the first is {absent[0]}"
-                + ("; --missing empty takes them as samples without detections" if len(absent) < len(self) else "")
-            )
-        nothing = Detections3D.empty(NUSCENES_CLASSES)
-        return {
-            token: detections_from_global(boxes[token], self.lidar_from_global(token)) if token in boxes else nothing
-            for token in self.ids
-        }
+        return {t: detections_from_global(boxes[t], self.lidar_from_global(t)) for t in self.ids if t in boxes}
 
     def write_results(
         self, path: Path, detections: Mapping[str, Detections3D], meta: Mapping[str, Any] | None = None

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
+from lcf3d.errors import FormatError
 from lcf3d.formats.coco import read_camera_detections
 from lcf3d.provenance import FusedDetections
 from lcf3d.structures import Detections2D, Detections3D, Frame
@@ -14,17 +15,36 @@ class NuscenesLidarResults:
     """3D detections of a nuScenes submission file.
 
     Args:
+        path: of the file, for messages.
         frames: by sample token, in canonical LiDAR frames.
         class_names: classes to take.
+        missing: ``error`` refuses samples that the file lacks, ``empty`` takes them as samples without detections.
     """
 
-    def __init__(self, frames: Mapping[str, Detections3D], class_names: Sequence[str]) -> None:
-        self._frames = frames
+    def __init__(
+        self, path: Path, frames: Mapping[str, Detections3D], class_names: Sequence[str], missing: str = "error"
+    ) -> None:
+        self.path, self._frames, self.missing = path, frames, missing
         self.class_names = tuple(class_names)
+
+    def load(self, frame_ids: Sequence[str]) -> None:
+        """See that the file has these samples.
+
+        Raises:
+            FormatError: some are missing; says how many and which first.
+        """
+        absent = [token for token in frame_ids if token not in self._frames]
+        if absent and (self.missing == "error" or len(absent) == len(frame_ids)):
+            raise FormatError(
+                f"{self.path} lacks {len(absent)} of {len(frame_ids)} samples, the first is {absent[0]}"
+                + ("; --missing empty takes them as samples without detections" if self.missing == "error" else "")
+            )
 
     def detect(self, frame: Frame) -> Detections3D:
         """The detections of one sample in its LiDAR frame."""
-        return self._frames[frame.id].with_classes(self.class_names)
+        self.load([frame.id] if self.missing == "error" else [])
+        found = self._frames.get(frame.id)
+        return Detections3D.empty(self.class_names) if found is None else found.with_classes(self.class_names)
 
 
 class NuscenesCameraResults:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 from lcf3d import plugins
 from lcf3d.datasets.base import Dataset, require_folder
-from lcf3d.errors import ConfigError, DatasetError
+from lcf3d.datasets.check import Finding
+from lcf3d.errors import ConfigError, DatasetError, Lcf3dError
 
 GROUP = "lcf3d.datasets"
 
@@ -30,6 +31,32 @@ def open_dataset(text: str | Path, **settings: Any) -> Dataset:
         GROUP, plugins.Spec(spec.kind, spec.argument, {**spec.settings, **given}), {"late_cameras": "drop"}
     )
     return dataset
+
+
+def check_dataset(
+    text: str, results: Path | None = None, progress: Callable[[int], Callable[[], None]] | None = None, **settings: Any
+) -> list[Finding]:
+    """What is wrong with a dataset, and with result files for it.
+
+    Args:
+        text: names the dataset, see `open_dataset`.
+        results: result files in its form, or None.
+        progress: is told the number of frames and gives what to call after each.
+        settings: settings of the kind; those that are None are left to it.
+
+    Raises:
+        Lcf3dError: it cannot be opened, and cannot say by rules what is wrong.
+    """
+    try:
+        dataset = open_dataset(text, **settings)
+    except Lcf3dError:
+        spec = named(text)
+        unreadable = getattr(plugins.load(GROUP, spec.kind), "check_unreadable", None)
+        findings = [] if unreadable is None else unreadable(spec.argument, settings.get("version"))
+        if not any(finding.severity == "error" for finding in findings):
+            raise
+        return list(findings)
+    return dataset.check(results, (lambda: None) if progress is None else progress(len(dataset)))
 
 
 def root_of(text: str, kinds: Sequence[str], what: str) -> tuple[str, Path]:

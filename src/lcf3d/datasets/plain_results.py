@@ -16,24 +16,29 @@ class _PlainResults:
 
     Args:
         folder: where the files lie.
-        frame_ids: the dataset's frames.
         class_names: classes to take.
-        missing: ``error`` refuses a folder that lacks frames, ``empty`` takes them as frames without detections.
+        missing: ``error`` refuses frames without a file, ``empty`` takes them as frames without detections.
 
     Raises:
-        DatasetError: no such folder, or frames are missing; says how many and which first.
+        DatasetError: no such folder.
     """
 
-    def __init__(
-        self, folder: Path | str, frame_ids: Sequence[str], class_names: Sequence[str], missing: str = "error"
-    ) -> None:
+    def __init__(self, folder: Path | str, class_names: Sequence[str], missing: str = "error") -> None:
         path = Path(folder)
         if not path.is_dir():
             raise DatasetError(f"result folder {path} does not exist")
         self.folder = path / "data" if (path / "data").is_dir() else path
         self.class_names = tuple(class_names)
+        self.missing = missing
+
+    def load(self, frame_ids: Sequence[str]) -> None:
+        """See that there are results of these frames.
+
+        Raises:
+            DatasetError: some are missing; says how many and which first.
+        """
         absent = [frame_id for frame_id in frame_ids if not self._path(frame_id).is_file()]
-        if absent and (missing == "error" or len(absent) == len(frame_ids)):
+        if absent and (self.missing == "error" or len(absent) == len(frame_ids)):
             raise DatasetError(
                 f"{self.folder} lacks the results of {len(absent)} of {len(frame_ids)} frames, first {absent[0]}.json"
             )
@@ -41,14 +46,21 @@ class _PlainResults:
     def _path(self, frame_id: str) -> Path:
         return self.folder / f"{frame_id}.json"
 
+    def _file(self, frame_id: str) -> Path | None:
+        """The file of a frame, None where it may be missing."""
+        path = self._path(frame_id)
+        if not path.is_file() and self.missing == "error":
+            raise DatasetError(f"{path} does not exist")
+        return path if path.is_file() else None
+
 
 class PlainLidarResults(_PlainResults):
     """3D detections, see `lcf3d.formats.plain`."""
 
     def detect(self, frame: Frame) -> Detections3D:
         """The detections of one frame."""
-        path = self._path(frame.id)
-        if not path.is_file():
+        path = self._file(frame.id)
+        if path is None:
             return Detections3D.empty(self.class_names)
         return read_detections_3d(path).with_classes(self.class_names)
 
@@ -62,8 +74,8 @@ class PlainCameraResults(_PlainResults):
 
     def detect(self, frame: Frame, camera: str) -> Detections2D:
         """The detections of one camera of one frame, clipped to its image."""
-        path = self._path(frame.id)
-        found = read_detections_2d(path) if path.is_file() else {}
+        path = self._file(frame.id)
+        found = read_detections_2d(path) if path is not None else {}
         if camera not in found:
             return Detections2D.empty(self.class_names)
         return found[camera].with_classes(self.class_names).clipped(frame.camera(camera))

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lcf3d.errors import DatasetError
-from lcf3d.evaluation.protocol import Evaluation, Verdict, open_evaluation
+from lcf3d.evaluation.protocol import Evaluation, Verdict, open_evaluation, usual_frames
 from lcf3d.fusion.calibration import Calibration, ScoreMap, ground_height
 from lcf3d.fusion.calibration_fit import block_folds, choose_map, fit_evidence, fit_map, log_loss
 from lcf3d.fusion.cluster_evidence import ClusterEvidence
@@ -265,7 +265,7 @@ def open_study(request: RunRequest, folds: int = 5, progress: Progress = lambda 
     Raises:
         Lcf3dError: something is absent, malformed or makes no sense; one sentence says what.
     """
-    found = read_inputs(replace(request, recovery="off"))
+    found = read_inputs(replace(request, recovery="off"), usual_frames)
     config = found.config.updated(ensemble="evidence", unmatched="downweight")
     evaluation = open_evaluation(found.dataset, found.frame_ids)
     frames = [found.dataset.frame(frame_id) for frame_id in found.frame_ids]

@@ -179,7 +179,7 @@ class DomainTaskRunner:
         teaching = []
         for frame in self._frames(max(1, len(self.dataset) // _TEACHING_FRAMES)):
             if seen := self._seen(frame):
-                teaching.append((frame, in_kitti_classes(self.lidar.detect(frame)), seen[self.front]))
+                teaching.append((frame, in_kitti_classes(self.lidar.detect(frame)), seen))
         # which classes the camera detects is learnt only from many frames; with few, none is taken as blind
         return self_calibrate(teaching, self.config).model_copy(update={"camera_classes": None})
 

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from functools import partial
+from typing import Any
 
 import numpy as np
 
 from lcf3d.evaluation.curves import precision_recall
-from lcf3d.evaluation.kitti import MEASURE_NAMES, KittiEvaluator, KittiMetrics, Selection
+from lcf3d.evaluation.kitti import MEASURE_NAMES, KittiEvaluator, Selection
 from lcf3d.evaluation.kitti_breakdown import IOU_THRESHOLDS, ap_by_distance, ap_over_iou
 from lcf3d.evaluation.kitti_matching import BELOW, COUNTS, FALSE_POSITIVE, IGNORED, TRUE_POSITIVE
 from lcf3d.evaluation.kitti_outcomes import WorkingPoint, fusion_outcomes, working_point
@@ -22,7 +23,7 @@ from lcf3d.structures import FloatArray, IntArray
 def study(
     evaluator: KittiEvaluator,
     name: str,
-    metrics: KittiMetrics,
+    metrics: Mapping[str, Any],
     provenance: Mapping[str, FusedDetections],
     camera_from_lidar: Callable[[str], FloatArray],
 ) -> Study:
@@ -31,7 +32,7 @@ def study(
     Args:
         evaluator: ground truth and results.
         name: what to call the result set.
-        metrics: the official curves.
+        metrics: the official numbers.
         provenance: by frame; with it, outcomes are split by what the fusion did.
         camera_from_lidar: (4, 4) rectified reference camera from LiDAR, of a frame.
     """
@@ -66,7 +67,7 @@ def study(
         name,
         "KITTI",
         evaluator.truth.frame_ids,
-        metrics.to_json(),
+        metrics,
         tuple(classes),
         wrong,
         missed,

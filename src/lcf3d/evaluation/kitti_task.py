@@ -37,7 +37,7 @@ from lcf3d.formats.kitti import (
     read_folder,
 )
 from lcf3d.geometry.camera import project_boxes
-from lcf3d.structures import Detections2D, Detections3D, Frame
+from lcf3d.structures import Detections2D, Detections3D, FloatArray, Frame
 
 Measure = Literal["3d", "bbox"]
 
@@ -213,10 +213,18 @@ class KittiResultSet:
         return study(
             self.evaluator,
             self.name,
-            self.metrics,
+            self.to_json(),
             provenance,
-            lambda frame_id: self.dataset.calibration(frame_id).camera_from_lidar,
+            self._camera_from_lidar,
         )
+
+    def _camera_from_lidar(self, frame_id: str) -> FloatArray:
+        """Of the calibration; without one, axes that point as KITTI's do."""
+        try:
+            transform: FloatArray = self.dataset.calibration(frame_id).camera_from_lidar
+        except DatasetError:
+            return np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
+        return transform
 
 
 def _remarks(metrics: KittiMetrics) -> list[str]:

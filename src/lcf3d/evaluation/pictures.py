@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from lcf3d.datasets.base import Dataset
+from lcf3d.errors import DatasetError
 from lcf3d.evaluation.report import OUTCOME_COLORS
 from lcf3d.evaluation.study import ShownBox, Study
 from lcf3d.evaluation.svg import Shape, bev_scene, image_scene
@@ -25,7 +26,12 @@ def worst_frame_pictures(study: Study, dataset: Dataset, count: int = 8) -> dict
     pictures = {}
     for f in study.worst_frames(count):
         heading = f"{study.frame_ids[f]}: {study.wrong[f]} wrong, {study.missed[f]} missed"
-        pictures[heading] = frame_picture(study, f, dataset.frame(study.frame_ids[f]))
+        try:
+            frame = dataset.frame(study.frame_ids[f])
+        except DatasetError:
+            # results can be measured without calibrations, but not drawn into images
+            frame = Frame(study.frame_ids[f])
+        pictures[heading] = frame_picture(study, f, frame)
     return pictures
 
 

@@ -110,8 +110,10 @@ class Evaluation(Protocol):
         heading: what `figures` gives, for example ``3D AP R40``.
         columns: names of the figures of a class.
         class_names: classes that are evaluated.
+        frame_ids: the frames.
     """
 
+    frame_ids: tuple[str, ...]
     heading: str
     columns: tuple[str, ...]
     class_names: tuple[str, ...]
@@ -159,6 +161,11 @@ def open_evaluation(
         options = replace(options, front=True)
     evaluation: Evaluation = kind(dataset, frame_ids, options)
     return evaluation
+
+
+def usual_frames(dataset: Dataset) -> tuple[str, ...]:
+    """The frames that the protocol of a dataset takes by itself, for example those of KITTI's ``val``."""
+    return open_evaluation(dataset).frame_ids
 
 
 def refuse_options(what: str, options: EvaluationOptions, *names: str) -> None:

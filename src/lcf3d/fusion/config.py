@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -137,14 +138,19 @@ class FusionConfig(BaseModel):
         return cls.of({**PRESETS[name], **changes}, source=f"preset {name}")
 
     @classmethod
-    def load(cls, name_or_path: str | Path) -> Self:
+    def load(cls, name_or_path: str | Path, class_names: Sequence[str] | None = None) -> Self:
         """A preset by name, or the settings of a YAML file (what it leaves out keeps its default).
+
+        Args:
+            name_or_path: name of a preset, or path of a file.
+            class_names: classes to detect, where preset or file do not say.
 
         Raises:
             ConfigError: neither, or a value that makes no sense; names the setting.
         """
+        own: dict[str, Any] = {} if class_names is None else {"class_names": tuple(class_names)}
         if name_or_path in PRESETS:
-            return cls.preset(str(name_or_path))
+            return cls.preset(str(name_or_path), **({} if "class_names" in PRESETS[str(name_or_path)] else own))
         path = Path(name_or_path).expanduser()
         if not path.is_file():
             raise ConfigError(f"{str(name_or_path)!r} is neither a preset ({', '.join(PRESETS)}) nor a file")
@@ -154,7 +160,7 @@ class FusionConfig(BaseModel):
             raise ConfigError(f"{path} is not valid YAML: {str(error).splitlines()[0]}") from None
         if not isinstance(values, dict):
             raise ConfigError(f"{path} must hold settings as 'name: value' lines")
-        return cls.of(values, source=str(path))
+        return cls.of({**own, **values}, source=str(path))
 
     @classmethod
     def of(cls, values: dict[str, Any], source: str = "settings") -> Self:
@@ -235,7 +241,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "min_quality": 0.0,
     },
     # measured: docs/when-fusion-helps.md. KITTI labels only what the front cameras see
-    "kitti": {"out_of_view": "drop"},
+    "kitti": {"class_names": KITTI_CLASSES, "out_of_view": "drop"},
     # measured with simulated camera detections only: docs/six-cameras.md
     "nuscenes": {
         "class_names": NUSCENES_CLASSES,

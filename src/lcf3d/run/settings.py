@@ -13,13 +13,20 @@ from lcf3d.fusion.config import FusionConfig
 from lcf3d.fusion.stereo import StereoConfig
 
 
-def build_config(name_or_path: str | Path, changes: Sequence[str] = (), stereo: bool = False) -> FusionConfig:
+def build_config(
+    name_or_path: str | Path,
+    changes: Sequence[str] = (),
+    stereo: bool = False,
+    class_names: Sequence[str] | None = None,
+) -> FusionConfig:
     """Settings from a preset or file, changed by ``name=value`` items; those of stereo pairs if ``stereo``.
+
+    ``class_names`` are the classes to detect, where preset or file do not say.
 
     Raises:
         ConfigError: unknown preset, file, setting or value, or one that has no effect under the others.
     """
-    config = (StereoConfig if stereo else FusionConfig).load(name_or_path)
+    config = (StereoConfig if stereo else FusionConfig).load(name_or_path, class_names)
     values: dict[str, Any] = {}
     for item in changes:
         name, equals, text = item.partition("=")

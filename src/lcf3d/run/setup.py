@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -118,8 +118,12 @@ def prepare_run(request: RunRequest, out: Path, *, resume: bool = False, overwri
     return Run(dataset, frame_ids, config, runner, folder)
 
 
-def read_inputs(request: RunRequest) -> Inputs:
+def read_inputs(request: RunRequest, usual: Callable[[Dataset], Sequence[str]] | None = None) -> Inputs:
     """The dataset, settings and both branches, result files read and images looked for.
+
+    Args:
+        request: what to read.
+        usual: the frames to take where neither a split nor frames are named; all without it.
 
     Raises:
         Lcf3dError: anything wrong with the request, the dataset or the result files.
@@ -127,12 +131,17 @@ def read_inputs(request: RunRequest) -> Inputs:
     require_missing(request.missing)
     dataset = open_dataset(request.dataset, split=request.split, version=request.tables)
     texts = camera_texts(request.cameras, dataset)
-    config = build_config(request.config or dataset.preset, request.changes, stereo=_is_stereo(texts, dataset))
+    config = build_config(
+        request.config or dataset.preset, request.changes, _is_stereo(texts, dataset), dataset.class_names
+    )
     if request.recovery is not None:
         if request.recovery not in ("on", "off"):
             raise ConfigError(f"--recovery takes on or off, got {request.recovery!r}")
         config = config.updated(recovery=request.recovery == "on")
-    frame_ids = require_frames(dataset, request.frames, request.dataset)
+    chosen: Sequence[str] = request.frames
+    if usual is not None and not chosen and request.split is None:
+        chosen = usual(dataset)
+    frame_ids = require_frames(dataset, chosen, request.dataset)
     dataset.require_complete(frame_ids)
     lidar = open_lidar(request.lidar, dataset, config.class_names, request.missing)
     cameras = by_camera(dataset, open_cameras(texts, dataset, config.class_names, request.missing, request.tiles))
