@@ -13,15 +13,16 @@ work. Writes the result files to ``OUT/results`` and the report of ``lcf3d gener
 from __future__ import annotations
 
 import argparse
+import json
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from lcf3d import Lcf3dError
-from lcf3d.cli.generalize import generalize
+from lcf3d import FusionConfig, Lcf3dError
 from lcf3d.datasets.kitti import KittiDataset
 from lcf3d.datasets.nuscenes import NuscenesDataset
+from lcf3d.evaluation.domain_report import run_tasks, to_json
 from lcf3d.formats.coco import write_camera_detections
 from lcf3d.formats.kitti import objects_from_detections, objects_from_detections_2d, write_objects
 from lcf3d.geometry.camera import project_boxes
@@ -133,15 +134,17 @@ def main() -> None:
         write_nuscenes_results(NuscenesDataset(arguments.nuscenes), results, rng)
         kitti = f"'kitti:{arguments.kitti}' 'camera=results:{results / 'k_2d'}' 'lidar=results:{results}"
         nuscenes = f"'nuscenes:{arguments.nuscenes}' 'camera=results:{results / 'n_2d.json'}' 'lidar=results:{results}"
-        generalize(
-            task=[
+        results = run_tasks(
+            [
                 f"kitti64->kitti64 {kitti}/k_home'",
                 f"kitti64->nuscenes32 {nuscenes}/n_away.json'",
                 f"nuscenes32->nuscenes32 {nuscenes}/n_home.json'",
                 f"nuscenes32->kitti64 {kitti}/k_away'",
             ],
-            out=arguments.out,
+            FusionConfig.preset("kitti"),
+            arguments.out,
         )
+        print(json.dumps(to_json(results), indent=2))
     except Lcf3dError as error:
         parser.error(str(error))
 

@@ -24,7 +24,6 @@ from lcf3d.evaluation.nuscenes import NuscenesMetrics, evaluate_nuscenes
 from lcf3d.formats.nuscenes_boxes import global_from_detections
 from lcf3d.fusion.evidence import Evidence
 from lcf3d.provenance import FusedDetections
-from lcf3d.run.results import NuscenesCameraResults, NuscenesLidarResults
 from lcf3d.structures import NUSCENES_CLASSES, Detections2D, Detections3D, Frame
 
 # the weights that the kitti preset has for people, without the competing, for every class
@@ -42,7 +41,7 @@ START: dict[str, Any] = {
     "ensemble": "probabilistic",
 }
 STEPS: dict[str, dict[str, Any]] = {
-    "METHOD's values": {},
+    "the method's values": {},
     "+ equal classes first": {"class_aware": True, "assignment": "class_first"},
     "+ match_iou 0.4": {"match_iou": 0.4},
     "+ evidence": {
@@ -86,8 +85,8 @@ def measure(root: Path, split: str, lidar: Path, camera: Path) -> list[dict[str,
     """One row for LiDAR alone and one for every step."""
     dataset = NuscenesDataset(root, split=split, late_cameras="drop")
     frames = [dataset.frame(token) for token in dataset.ids]
-    found3d = NuscenesLidarResults(lidar, dataset, NUSCENES_CLASSES)
-    found2d = NuscenesCameraResults(camera, NUSCENES_CLASSES)
+    found3d = dataset.lidar_results(lidar, NUSCENES_CLASSES)
+    found2d = dataset.camera_results(camera, NUSCENES_CLASSES)
     lidar_of = {frame.id: found3d.detect(frame) for frame in frames}
     camera_of: dict[str, dict[str, Detections2D]] = {
         frame.id: {view.name: found2d.detect(frame, view.name) for view in frame.cameras} for frame in frames

@@ -13,8 +13,8 @@ import numpy as np
 
 from lcf3d.datasets.kitti import KittiDataset
 from lcf3d.geometry.iou import bev_iou, iou_3d
-from lcf3d.provenance import Reason, Outcome
-from lcf3d.run.folder import KittiRunFolder
+from lcf3d.provenance import Outcome, Reason
+from lcf3d.run.folder import RunFolder
 
 # Van and Person_sitting are neighbours of Car and Pedestrian: a box on one of them is no mistake
 CLASSES = ("Car", "Pedestrian", "Cyclist", "Van", "Truck", "Person_sitting", "Misc")
@@ -26,7 +26,7 @@ def main() -> None:
     parser.add_argument("root", type=Path, help="KITTI-layout folder")
     parser.add_argument("run", type=Path, help="folder written by lcf3d run")
     arguments = parser.parse_args()
-    dataset, folder = KittiDataset(arguments.root, class_names=CLASSES), KittiRunFolder(arguments.run)
+    dataset, folder = KittiDataset(arguments.root, class_names=CLASSES), RunFolder(arguments.run)
     for path in sorted((arguments.run / "provenance").glob("*.json")):
         fused, frame = folder.read(path.stem), dataset.frame(path.stem)
         counts = np.bincount(fused.outcomes, minlength=4)

@@ -12,21 +12,19 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from lcf3d import FusionConfig, LateCascadeFusion, Lcf3dError
-from lcf3d.cli.calibrate import open_study
-from lcf3d.evaluation.calibration_study import CalibrationStudy, average_precisions, result_objects
-from lcf3d.evaluation.kitti import KittiMetrics, evaluate
+from lcf3d.evaluation.calibration_study import CalibrationStudy, open_study
 from lcf3d.evaluation.svg import PALETTE, Line, line_chart
-from lcf3d.formats.kitti import KittiFrames
 from lcf3d.fusion.calibration import Calibration, natural_transform, transform_scores
 from lcf3d.fusion.evidence import SUPPORT_IOU
 from lcf3d.fusion.self_calibration import self_calibrate
+from lcf3d.run.setup import RunRequest
 from lcf3d.structures import Detections2D, Detections3D
 
 PRESET = FusionConfig.preset("kitti").updated(recovery=False)
@@ -57,30 +55,27 @@ PAIRS = (
 def open_pair(data: Path, pair: Pair, folds: int) -> CalibrationStudy:
     """Frames, labels and detections of a pair."""
     root = data / pair.folder
-    branches = [f"results:{root / 'results' / name}" for name in (pair.lidar, pair.camera)]
-    return open_study(f"kitti:{root}", "val", *branches, PRESET, folds, quiet=True)
+    lidar, camera = (f"results:{root / 'results' / name}" for name in (pair.lidar, pair.camera))
+    return open_study(RunRequest(f"kitti:{root}", lidar, {"*": camera}, "val", config="kitti"), folds)
 
 
 def fuse(
     study: CalibrationStudy,
     lidar: Sequence[Detections3D],
-    camera: Sequence[Detections2D],
+    camera: Sequence[Mapping[str, Detections2D]],
     config: FusionConfig | None,
     calibration: Calibration | None = None,
-) -> KittiMetrics:
-    """Metrics of the fusion (of the LiDAR branch alone without ``config``), self-calibrated if not told otherwise."""
-    results = []
+) -> dict[str, tuple[float, ...]]:
+    """3D AP of the fusion (of the LiDAR branch alone without ``config``), self-calibrated if not told otherwise."""
+    results = list(lidar)
     if config is not None:
         taught = calibration or self_calibrate(zip(study.frames, lidar, camera, strict=True), config)
         if config is FILTER:
             # the paper judges every class, known to the camera or not
             taught = taught.model_copy(update={"camera_classes": None})
         fusion = LateCascadeFusion(config, calibration=taught)
-    for frame, boxes, found in zip(study.frames, lidar, camera, strict=True):
-        if config is not None:
-            boxes = fusion(frame, boxes, {frame.cameras[0].name: found}).detections
-        results.append(result_objects(frame, boxes))
-    return evaluate(study.truth, KittiFrames.from_frames(study.truth.frame_ids, results))
+        results = [fusion(*item).detections for item in zip(study.frames, lidar, camera, strict=True)]
+    return study.evaluation.figures(results)
 
 
 def table(studies: dict[Pair, CalibrationStudy]) -> list[dict[str, object]]:
@@ -99,7 +94,7 @@ def table(studies: dict[Pair, CalibrationStudy]) -> list[dict[str, object]]:
         }
         for name in pair.classes:
             ap = {ALONE: reports[name].before}
-            ap |= {way: average_precisions(metrics, name) for way, metrics in ways.items()}
+            ap |= {way: figures[name] for way, figures in ways.items()}
             if not any(name in evidence for evidence in others):
                 del ap["evidence of the other folder"]
             ap["calibrated, cross-validated"] = reports[name].after
@@ -130,24 +125,26 @@ def cell(value: float, before: float, alone: bool) -> str:
 
 def noisy_lidar(study: CalibrationStudy, amount: float) -> CalibrationStudy:
     """Noise on the LiDAR scores: ``amount`` times the spread of the (transformed) scores."""
-    objects = study.lidar_results.objects
-    assert objects.scores is not None
-    x = transform_scores(objects.scores, natural_transform(objects.scores))
-    noise = np.random.default_rng(0).normal(0, 1, len(x)) * x.std()
-    lidar = replace(study.lidar_results, objects=replace(objects, scores=x + amount * noise))
-    return altered(study, lidar, study.camera_results)
+    scores = np.concatenate([found.scores for found in study.lidar_inputs])
+    x = transform_scores(scores, natural_transform(scores))
+    x = x + amount * np.random.default_rng(0).normal(0, 1, len(x)) * x.std()
+    parts = np.split(x, np.cumsum([len(found) for found in study.lidar_inputs])[:-1])
+    lidar = [replace(found, scores=own) for found, own in zip(study.lidar_inputs, parts, strict=True)]
+    return altered(study, lidar, study.camera_inputs)
 
 
 def thinned_camera(study: CalibrationStudy, share: float) -> CalibrationStudy:
     """Without a random ``share`` of the camera detections."""
     rng = np.random.default_rng(0)
-    frames = [found[rng.random(len(found)) >= share] for found in study.camera_results]
-    return altered(study, study.lidar_results, KittiFrames.from_frames(study.truth.frame_ids, frames))
+    camera = [{n: d[rng.random(len(d)) >= share] for n, d in seen.items()} for seen in study.camera_inputs]
+    return altered(study, study.lidar_inputs, camera)
 
 
-def altered(study: CalibrationStudy, lidar: KittiFrames, camera: KittiFrames) -> CalibrationStudy:
+def altered(
+    study: CalibrationStudy, lidar: Sequence[Detections3D], camera: Sequence[Mapping[str, Detections2D]]
+) -> CalibrationStudy:
     """The same frames with other detections."""
-    return CalibrationStudy(study.frames, study.truth, lidar, camera, study.config, study.folds)
+    return CalibrationStudy(study.frames, study.evaluation, lidar, camera, study.config, study.folds)
 
 
 def sweep_chart(study: CalibrationStudy, class_name: str, worse: str) -> str:
@@ -158,7 +155,7 @@ def sweep_chart(study: CalibrationStudy, class_name: str, worse: str) -> str:
         at = noisy_lidar(study, amount) if worse == "lidar" else thinned_camera(study, amount)
         ways = ((None, None), (FILTER, None), (PRESET, None), (PRESET, at.fit()))
         for values, (config, calibration) in zip(curves.values(), ways, strict=True):
-            values.append(fuse(at, at.lidar_inputs, at.camera_inputs, config, calibration).ap(class_name))
+            values.append(fuse(at, at.lidar_inputs, at.camera_inputs, config, calibration)[class_name][1])
     lines = [
         Line(way, amounts, values, color, dashed=way == ALONE)
         for (way, values), color in zip(curves.items(), (PALETTE[8], *PALETTE[1::-1], PALETTE[2]), strict=True)

@@ -91,3 +91,8 @@ def test_torch_and_onnxruntime_are_imported_in_one_place() -> None:
         if name.split(".")[0] in ("torch", "torchvision", "onnxruntime")
     ]
     assert not wrong, "\n".join(wrong)
+
+
+def test_studies_do_not_import_the_command_line() -> None:
+    studies = Path(__file__).parents[1] / "benchmarks"
+    assert not [str(path) for path in studies.rglob("*.py") if any(n.startswith("lcf3d.cli") for n in imports(path))]

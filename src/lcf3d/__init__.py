@@ -3,41 +3,117 @@
 from __future__ import annotations
 
 from importlib import import_module
+from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
 from lcf3d.errors import Lcf3dError
 from lcf3d.structures import KITTI_CLASSES, NUSCENES_CLASSES, Camera, Detections2D, Detections3D, Frame, InstanceMask
 
 if TYPE_CHECKING:
+    from lcf3d.api import draw, evaluate, read_run, run
+    from lcf3d.datasets.base import BaseDataset, Dataset
+    from lcf3d.datasets.convert import write_kitti, write_nuscenes
+    from lcf3d.datasets.kitti import KittiDataset
+    from lcf3d.datasets.nuscenes import NuscenesDataset
+    from lcf3d.datasets.opening import open_dataset
+    from lcf3d.detectors.named import load_detector
+    from lcf3d.formats.coco import read_camera_detections, read_coco_index, read_coco_results
+    from lcf3d.formats.plain import read_detections_2d, read_detections_3d, write_detections_2d, write_detections_3d
+    from lcf3d.fusion.calibration import Calibration
     from lcf3d.fusion.config import FusionConfig
+    from lcf3d.fusion.evidence import Evidence
     from lcf3d.fusion.pipeline import LateCascadeFusion
-    from lcf3d.provenance import FusedDetections
+    from lcf3d.fusion.self_calibration import self_calibrate
+    from lcf3d.fusion.stereo import StereoConfig, StereoLateCascadeFusion
+    from lcf3d.localizers.named import load_localizer
+    from lcf3d.provenance import FusedDetections, Outcome, Reason
 
-__version__ = "0.1.0"
+try:
+    __version__ = version("lcf3d")
+except PackageNotFoundError:  # run from a source tree that is not installed
+    __version__ = "0+unknown"
+
+# name -> module; scipy, numba and pydantic are imported when first needed, so that ``import lcf3d`` stays quick
+_LAZY = {
+    "BaseDataset": "datasets.base",
+    "Calibration": "fusion.calibration",
+    "Dataset": "datasets.base",
+    "Evidence": "fusion.evidence",
+    "FusedDetections": "provenance",
+    "FusionConfig": "fusion.config",
+    "KittiDataset": "datasets.kitti",
+    "LateCascadeFusion": "fusion.pipeline",
+    "NuscenesDataset": "datasets.nuscenes",
+    "Outcome": "provenance",
+    "Reason": "provenance",
+    "StereoConfig": "fusion.stereo",
+    "StereoLateCascadeFusion": "fusion.stereo",
+    "draw": "api",
+    "evaluate": "api",
+    "load_detector": "detectors.named",
+    "load_localizer": "localizers.named",
+    "open_dataset": "datasets.opening",
+    "read_camera_detections": "formats.coco",
+    "read_coco_index": "formats.coco",
+    "read_coco_results": "formats.coco",
+    "read_detections_2d": "formats.plain",
+    "read_detections_3d": "formats.plain",
+    "read_run": "api",
+    "run": "api",
+    "self_calibrate": "fusion.self_calibration",
+    "write_detections_2d": "formats.plain",
+    "write_detections_3d": "formats.plain",
+    "write_kitti": "datasets.convert",
+    "write_nuscenes": "datasets.convert",
+}
 
 __all__ = [
     "KITTI_CLASSES",
     "NUSCENES_CLASSES",
+    "BaseDataset",
+    "Calibration",
     "Camera",
+    "Dataset",
     "Detections2D",
     "Detections3D",
+    "Evidence",
     "Frame",
     "FusedDetections",
     "FusionConfig",
     "InstanceMask",
+    "KittiDataset",
     "LateCascadeFusion",
     "Lcf3dError",
+    "NuscenesDataset",
+    "Outcome",
+    "Reason",
+    "StereoConfig",
+    "StereoLateCascadeFusion",
+    "draw",
+    "evaluate",
+    "load_detector",
+    "load_localizer",
+    "open_dataset",
+    "read_camera_detections",
+    "read_coco_index",
+    "read_coco_results",
+    "read_detections_2d",
+    "read_detections_3d",
+    "read_run",
+    "run",
+    "self_calibrate",
+    "write_detections_2d",
+    "write_detections_3d",
+    "write_kitti",
+    "write_nuscenes",
 ]
-
-# scipy, numba and pydantic are imported when first needed, so that ``import lcf3d`` stays quick
-_LAZY = {
-    "LateCascadeFusion": "lcf3d.fusion.pipeline",
-    "FusionConfig": "lcf3d.fusion.config",
-    "FusedDetections": "lcf3d.provenance",
-}
 
 
 def __getattr__(name: str) -> Any:
     if name in _LAZY:
-        return getattr(import_module(_LAZY[name]), name)
+        return getattr(import_module(f"lcf3d.{_LAZY[name]}"), name)
     raise AttributeError(f"module 'lcf3d' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -35,7 +35,7 @@ def groups(index):
 
 
 def greedy_cliques(boxes, scores, g):
-    """METHOD's rule in plain Python."""
+    """The rule of docs/method.md in plain Python."""
     free = sorted(range(len(boxes)), key=lambda i: -scores[i])
     clusters = []
     while free:

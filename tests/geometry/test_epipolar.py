@@ -87,7 +87,7 @@ def test_all_lines_pass_through_the_epipole(rig):
 
 @given(rigs())
 def test_formula_with_rotation_and_translation(rig):
-    # METHOD "Stereo": F = K_r^-T [t]x R K_l^-1, for projections without a translation column
+    # docs/method.md, stereo: F = K_r^-T [t]x R K_l^-1, for projections without a translation column
     left, right = (replace(v, projection=np.column_stack([v.intrinsics, np.zeros(3)])) for v in rig)
     right_from_left = right.camera_from_lidar @ np.linalg.inv(left.camera_from_lidar)
     x, y, z = right_from_left[:3, 3]

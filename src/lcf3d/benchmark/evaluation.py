@@ -1,4 +1,4 @@
-"""Speed of the KITTI evaluation: three classes, 2D, orientation, BEV and 3D (DESIGN "Speed")."""
+"""Speed of the KITTI evaluation: three classes, 2D, orientation, BEV and 3D."""
 
 from __future__ import annotations
 

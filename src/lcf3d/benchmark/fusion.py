@@ -1,4 +1,4 @@
-"""Speed of the fusion's stages (DESIGN "Speed")."""
+"""Speed of the fusion's stages."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from lcf3d.localizers.named import load_localizer
 MATCHING_BUDGETS_MS = {(200, 20): 0.9, (500, 40): 3.0}
 SEMANTIC_BUDGET_MS = 0.14
 RECOVERY_BUDGETS_MS = {"geometric": 5.0, "network": 15.0}
-"""Those of DESIGN: 15 ms for a network, then 5."""
+"""15 ms for a network, then 5."""
 STEP_BUDGET_MS = 5.0
 
 

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-
-from lcf3d.errors import ConfigError
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -43,48 +42,24 @@ def generalize(
     import json
 
     from rich.console import Console
+    from rich.progress import Progress
 
-    from lcf3d.evaluation.domain_report import charts, html_report, standalone_svg, to_json
-    from lcf3d.evaluation.domain_tasks import DomainTaskRunner, parse_task
-    from lcf3d.files import write_json, write_text
+    from lcf3d.evaluation.domain_report import run_tasks, to_json
     from lcf3d.run.settings import build_config
-    from lcf3d.structures import KITTI_CLASSES
 
-    names = tuple(class_ or KITTI_CLASSES)
-    if unknown := [name for name in names if name not in KITTI_CLASSES]:
-        raise ConfigError(f"--class takes {', '.join(KITTI_CLASSES)}, got {unknown[0]!r}")
-    if out.is_file():
-        raise ConfigError(f"{out} is a file; choose a folder for --out")
     settings = build_config(config, list(set_ or ()))
-    # everything is opened before anything is run: most mistakes are found at once
-    tasks = [parse_task(text) for text in task]
-    if doubles := [t.name for i, t in enumerate(tasks) if t.name in {other.name for other in tasks[:i]}]:
-        raise ConfigError(f"two tasks are named {doubles[0]!r}; tell them apart, for example as kitti-b->kitti")
-    runners = [DomainTaskRunner(parsed, settings) for parsed in tasks]
-    results = _run(runners, names, quiet=json_)
-    settings.dump(out / "config.yaml")
-    write_json(out / "domain_shift.json", to_json(results))
-    write_text(out / "report.html", html_report(results))
-    for (tested, name), svg in charts(results).items():
-        write_text(out / "charts" / f"{tested}_{name}.svg".replace("/", "_"), standalone_svg(svg))
+    with Progress(console=Console(stderr=True), disable=json_, transient=True) as progress:
+
+        def begin(name: str, frames: int) -> Callable[[], None]:
+            bar = progress.add_task(name, total=frames)
+            return lambda: progress.advance(bar)
+
+        results = run_tasks(task, settings, out, tuple(class_ or ()), begin)
     if json_:
         typer.echo(json.dumps(to_json(results), indent=2))
         return
     Console().print(_table(results))
     typer.echo(f"report in {out / 'report.html'}")
-
-
-def _run(runners: list, names: tuple[str, ...], quiet: bool) -> Results:  # type: ignore[type-arg]
-    """All tasks under a progress bar."""
-    from rich.console import Console
-    from rich.progress import Progress
-
-    results = []
-    with Progress(console=Console(stderr=True), disable=quiet, transient=True) as progress:
-        for runner in runners:
-            bar = progress.add_task(runner.task.name, total=len(runner))
-            results.append((runner.task, runner(names, lambda bar=bar: progress.advance(bar))))
-    return results
 
 
 def _table(results: Results) -> Table:

@@ -33,8 +33,8 @@ class Interval:
 
     @classmethod
     def of(cls, value: float, samples: FloatArray, level: float = 0.95) -> Interval:
-        """The central interval that holds the share ``level`` of ``samples``."""
-        low, high = np.quantile(samples, [(1 - level) / 2, (1 + level) / 2])
+        """The central interval that holds the share ``level`` of ``samples``; those of NaN are left out."""
+        low, high = np.nanquantile(samples, [(1 - level) / 2, (1 + level) / 2])
         return cls(float(value), float(low), float(high))
 
 

@@ -183,8 +183,11 @@ def resampled_aps(
 
 
 def _weighted_aps(hits: BoolArray, drawn: IntArray, objects: IntArray, first: int, min_precision: float) -> FloatArray:
-    """(B,) average precision of detections in descending score, each counted (B, N) ``drawn`` times."""
-    aps = np.zeros(len(drawn))
+    """(B,) average precision of detections in descending score, each counted (B, N) ``drawn`` times.
+
+    NaN where no object was drawn.
+    """
+    aps = np.where(objects > 0, 0.0, np.nan)
     if not len(hits):
         return aps
     true = np.cumsum(drawn * hits, axis=1)

@@ -163,7 +163,7 @@ def compare_aps(first: Mapping[str, Any], second: Mapping[str, Any]) -> list[Com
     """Rows of two result sets: (1 + B,) AP by class, the value itself and then its resamples; and their mean."""
     columns = {name: (first[name], second[name]) for name in first if name in second}
     if columns:
-        columns["mean"] = tuple(np.mean([pair[i] for pair in columns.values()], axis=0) for i in range(2))  # type: ignore[assignment]
+        columns["mean"] = tuple(np.nanmean([pair[i] for pair in columns.values()], axis=0) for i in range(2))  # type: ignore[assignment]
     return [
         ComparisonRow(name, "AP", "", *(Interval.of(v[0], v[1:]) for v in (a, b, b - a)))
         for name, (a, b) in columns.items()

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from html import escape
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from lcf3d.errors import ConfigError
 from lcf3d.evaluation.domain_shift import IOU_THRESHOLDS, ShiftMetrics
-from lcf3d.evaluation.domain_tasks import LIDAR_ALONE, DomainTask
+from lcf3d.evaluation.domain_tasks import LIDAR_ALONE, DomainTask, DomainTaskRunner, parse_task
 from lcf3d.evaluation.svg import PALETTE, Line, line_chart
+from lcf3d.files import write_json, write_text
+from lcf3d.fusion.config import FusionConfig
+from lcf3d.structures import KITTI_CLASSES
 
 COLUMNS = ("NDS^", "mAP", "mATE", "mASE", "mAOE")
 """Columns of the paper's table; the first two are better when higher, the others when lower."""
@@ -122,3 +127,40 @@ def _table(results: Results) -> str:
             rows.append(f"<tr{' class=first' if i == 0 else ''}>{head}{''.join(cells)}</tr>")
     heading = "".join(f"<th>{name}</th>" for name in ("task", "method", *COLUMNS))
     return f"<table><tr>{heading}</tr>{''.join(rows)}</table>"
+
+
+def run_tasks(
+    texts: Sequence[str],
+    settings: FusionConfig,
+    out: Path,
+    class_names: Sequence[str] = (),
+    begin: Callable[[str, int], Callable[[], None]] = lambda name, frames: lambda: None,
+) -> Results:
+    """Run tasks and write settings, numbers, report and charts into a folder.
+
+    Args:
+        texts: tasks, see `lcf3d.evaluation.domain_tasks.parse_task`.
+        settings: of the fusion, in KITTI's classes.
+        out: the folder.
+        class_names: classes to evaluate, KITTI's without them.
+        begin: is told name and number of frames of each task and gives what to call after each frame.
+
+    Raises:
+        Lcf3dError: a task, its dataset or its detectors are wrong; everything is opened before anything is run.
+    """
+    names = tuple(class_names or KITTI_CLASSES)
+    if unknown := [name for name in names if name not in KITTI_CLASSES]:
+        raise ConfigError(f"--class takes {', '.join(KITTI_CLASSES)}, got {unknown[0]!r}")
+    if out.is_file():
+        raise ConfigError(f"{out} is a file; choose a folder for --out")
+    tasks = [parse_task(text) for text in texts]
+    if doubles := [t.name for i, t in enumerate(tasks) if t.name in {other.name for other in tasks[:i]}]:
+        raise ConfigError(f"two tasks are named {doubles[0]!r}; tell them apart, for example as kitti-b->kitti")
+    runners = [DomainTaskRunner(task, settings) for task in tasks]
+    results = [(runner.task, runner(names, begin(runner.task.name, len(runner)))) for runner in runners]
+    settings.dump(out / "config.yaml")
+    write_json(out / "domain_shift.json", to_json(results))
+    write_text(out / "report.html", html_report(results))
+    for (tested, name), svg in charts(results).items():
+        write_text(out / "charts" / f"{tested}_{name}.svg".replace("/", "_"), standalone_svg(svg))
+    return results

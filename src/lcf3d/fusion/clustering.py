@@ -1,4 +1,4 @@
-"""Clusters of LiDAR boxes in bird's-eye view (paper section 4.1.3, equation 2; METHOD "Bounding Box Matching" 1-2)."""
+"""Clusters of LiDAR boxes in bird's-eye view (paper section 4.1.3, equation 2; docs/method.md, matching 1-2)."""
 
 from __future__ import annotations
 

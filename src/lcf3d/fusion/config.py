@@ -228,7 +228,7 @@ STAGES = {
 
 PRESETS: dict[str, dict[str, Any]] = {
     "default": {},
-    # the paper's own values for KITTI: METHOD's table
+    # the paper's own values for KITTI: docs/method.md
     "paper": {
         "camera_score_threshold": 0.5,
         "decisive_score": 0.0,

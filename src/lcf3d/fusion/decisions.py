@@ -37,7 +37,7 @@ class ClusterDecisions(NamedTuple):
 
 
 def choose_representatives(branches: Branches, clusters: Clusters, matches: Matches, config: FusionConfig) -> IntArray:
-    """(C,) the LiDAR detection that stands for each cluster (METHOD, matching 5)."""
+    """(C,) the LiDAR detection that stands for each cluster (docs/method.md, matching 5)."""
     box = clusters.representative.copy()
     if config.representative == "camera_class":
         matched = np.flatnonzero(matches.camera >= 0)
@@ -57,7 +57,7 @@ def decide_clusters(
     judged: BoolArray,
     weighed: FloatArray | None = None,
 ) -> ClusterDecisions:
-    """Semantic fusion for matched clusters (Algorithm 1), the chosen policy for all others (METHOD, matching 6).
+    """Semantic fusion for matched clusters (Algorithm 1), a policy for the others (docs/method.md, matching 6).
 
     Args:
         box: (C,) the LiDAR detection that stands for each cluster.

@@ -1,4 +1,4 @@
-"""Frustum proposals: the LiDAR points behind a 2D box (paper section 4.1.4; METHOD "Detection Recovery" 1-4)."""
+"""Frustum proposals: the LiDAR points behind a 2D box (paper section 4.1.4; docs/method.md, recovery 1-4)."""
 
 from __future__ import annotations
 

@@ -151,7 +151,7 @@ def match_view(
 
 
 def merge_views(views: Sequence[View], cluster_count: int) -> Matches:
-    """The matches of all cameras: each cluster once, through the camera of highest IoU (METHOD, matching 7)."""
+    """The matches of all cameras: each cluster once, through the camera of highest IoU (docs/method.md, matching 7)."""
     camera = np.full(cluster_count, -1, dtype=np.int64)
     detection = np.full(cluster_count, -1, dtype=np.int64)
     best = np.full(cluster_count, np.nan)
@@ -172,7 +172,7 @@ def confirmed_elsewhere(
     """Which of the (M, 4) 2D boxes of camera ``at`` show an object that was confirmed through another camera only.
 
     Such a box overlaps, with IoU above the threshold, the projection of a cluster that is matched elsewhere and not
-    here; it is no candidate for recovery (METHOD, matching 7).
+    here; it is no candidate for recovery (docs/method.md, matching 7).
     """
     others = (matches.camera >= 0) & (views[at].match < 0)
     shown = image_iou(views[at].boxes[clusters.representative[others]], boxes2d)

@@ -57,7 +57,7 @@ def _bound_projections(corners, edges, projection, near, bounds):  # type: ignor
 
 
 def project_boxes(boxes: FloatArray, camera: Camera) -> tuple[FloatArray, BoolArray]:
-    """Image boxes of 3D boxes (METHOD "Projection and visibility"; paper section 4.1.3).
+    """Image boxes of 3D boxes (docs/method.md, projection; paper section 4.1.3).
 
     Each box is cut at the near plane, projected, bounded by an axis-aligned rectangle and clipped to the image.
 

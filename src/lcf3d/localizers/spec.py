@@ -1,6 +1,6 @@
 """What a frustum network needs to know beside its weights, and how boxes are written as its outputs.
 
-The two forms of METHOD, "Frustum PointNet", share this: 3 values of the centre, size scores and residuals of every
+The two forms of the Frustum PointNet share this: 3 values of the centre, size scores and residuals of every
 class template, scores and residuals of 12 headings (Qi et al. 2018, section 4.3).
 """
 

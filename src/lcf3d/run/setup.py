@@ -90,13 +90,27 @@ class Run:
     folder: RunFolder
 
 
-def prepare_run(request: RunRequest, out: Path, *, resume: bool = False, overwrite: bool = False) -> Run:
+def prepare_run(
+    request: RunRequest,
+    out: Path,
+    *,
+    resume: bool = False,
+    overwrite: bool = False,
+    settings: FusionConfig | None = None,
+) -> Run:
     """Read and check everything that can be checked, then begin the output folder.
+
+    Args:
+        request: what to run.
+        out: the run folder.
+        resume: continue a run that was interrupted.
+        overwrite: replace the run that ``out`` holds.
+        settings: instead of those that the request names.
 
     Raises:
         Lcf3dError: anything wrong with the request, the dataset or the result files.
     """
-    dataset, frame_ids, config, lidar, cameras, localizer = read_inputs(request)
+    dataset, frame_ids, config, lidar, cameras, localizer = read_inputs(request, settings=settings)
     folder = RunFolder(out, dataset.writer(out))
     runner = FrameRunner(dataset, lidar, cameras, make_fusion(config, localizer), folder)
     from lcf3d import __version__
@@ -118,12 +132,17 @@ def prepare_run(request: RunRequest, out: Path, *, resume: bool = False, overwri
     return Run(dataset, frame_ids, config, runner, folder)
 
 
-def read_inputs(request: RunRequest, usual: Callable[[Dataset], Sequence[str]] | None = None) -> Inputs:
+def read_inputs(
+    request: RunRequest,
+    usual: Callable[[Dataset], Sequence[str]] | None = None,
+    settings: FusionConfig | None = None,
+) -> Inputs:
     """The dataset, settings and both branches, result files read and images looked for.
 
     Args:
         request: what to read.
         usual: the frames to take where neither a split nor frames are named; all without it.
+        settings: instead of those that the request names.
 
     Raises:
         Lcf3dError: anything wrong with the request, the dataset or the result files.
@@ -131,7 +150,7 @@ def read_inputs(request: RunRequest, usual: Callable[[Dataset], Sequence[str]] |
     require_missing(request.missing)
     dataset = open_dataset(request.dataset, split=request.split, version=request.tables)
     texts = camera_texts(request.cameras, dataset)
-    config = build_config(
+    config = settings or build_config(
         request.config or dataset.preset, request.changes, _is_stereo(texts, dataset), dataset.class_names
     )
     if request.recovery is not None:
