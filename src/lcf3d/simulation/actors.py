@@ -8,13 +8,15 @@ from functools import lru_cache
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lcf3d.simulation.meshes import people, two_wheelers, vehicles
 from lcf3d.simulation.meshes.car_shapes import SHAPES
 from lcf3d.simulation.meshes.cars import build_car
-from lcf3d.simulation.meshes.primitives import Mesh
+from lcf3d.simulation.meshes.primitives import Mesh, rotation_z
 from lcf3d.simulation.roads import Path
 from lcf3d.simulation.sizes import draw_size
+from lcf3d.simulation.worlds import level_from_tilted
 
 Colour = tuple[float, float, float]
 
@@ -143,16 +145,26 @@ class Actor:
     mesh_at: Callable[[float], Mesh]
     stopped: bool = False
 
-    def box(self, time: float, ground: float) -> tuple[float, float, float, float, float, float, float]:
-        """World box (x, y, z of the geometric centre, length, width, height, yaw), standing at height ``ground``."""
+    def box(
+        self, time: float, ground: float, up: NDArray[np.float64] | None = None
+    ) -> tuple[float, float, float, float, float, float, float]:
+        """World box (x, y, z of the geometric centre, length, width, height, yaw), standing at height ``ground``.
+
+        ``up`` (3,) is where the object's own vertical points, None for straight up; the box is upright all the same.
+        """
         x, y, yaw = self.motion.pose(time)
         length, width, height = self.size
-        return x, y, ground + height / 2, length, width, height, yaw
+        if up is None:
+            return x, y, ground + height / 2, length, width, height, yaw
+        centre = np.array([x, y, ground]) + up * height / 2
+        return float(centre[0]), float(centre[1]), float(centre[2]), length, width, height, yaw
 
-    def mesh(self, time: float, ground: float) -> Mesh:
-        """Mesh in the world, standing at height ``ground``."""
+    def mesh(self, time: float, ground: float, up: NDArray[np.float64] | None = None) -> Mesh:
+        """Mesh in the world, standing at height ``ground``, its vertical along ``up`` (3,) or straight up."""
         x, y, yaw = self.motion.pose(time)
-        return self.mesh_at(time).placed(x, y, ground, yaw)
+        if up is None:
+            return self.mesh_at(time).placed(x, y, ground, yaw)
+        return self.mesh_at(time).turned(level_from_tilted(up).T @ rotation_z(yaw)).moved((x, y, ground))
 
 
 def _colour(rng: np.random.Generator) -> Colour:

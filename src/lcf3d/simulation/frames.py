@@ -22,6 +22,7 @@ from lcf3d.simulation.light import make_light
 from lcf3d.simulation.presets import Preset, get_preset
 from lcf3d.simulation.rays import RayTracer
 from lcf3d.simulation.scene import Scene, build_scene
+from lcf3d.simulation.worlds import level_from_tilted
 from lcf3d.structures import (
     KITTI_CLASSES,
     NUSCENES_CLASSES,
@@ -44,7 +45,8 @@ class SimulatedFrame:
         preset: sensors and weather.
         scene: the street and everybody on it.
         time: seconds into the drive.
-        world_from_lidar: (4, 4) pose of the LiDAR; upright, so that boxes upright in the world are upright for it.
+        world_from_lidar: (4, 4) pose of the LiDAR; upright, so that boxes upright in the world are upright for it,
+            unless the preset's world has a mounting.
         scan: LiDAR returns with the actors they came from.
         renders: image, owner and depth by camera name; empty when images were not asked for.
         boxes: (A, 7) boxes of all actors in the LiDAR frame.
@@ -238,14 +240,37 @@ def _look(
 def make_stage(scene: Scene, preset: Preset, time: float) -> Stage:
     """Triangles, light and pose of a scene at a moment, ready for rays."""
     snapshot = scene.at(time)
-    x, y, yaw = scene.ego.pose(time)
-    pose = np.eye(4)
-    pose[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
-    pose[:3, 3] = x, y, float(scene.site.terrain.height(x, y)) + preset.lidar.height_m
+    pose = sensor_pose(scene, preset, time)
+    x = float(pose[0, 3])
     light = make_light(
         scene.sun, scene.cloudiness, scene.haze_m, scene.look, preset.rain, preset.night, lamp_positions(scene, x)
     )
     return Stage(RayTracer(snapshot.mesh.corners), snapshot.mesh, snapshot.owner, light, scene.site.markings(), pose)
+
+
+def sensor_pose(scene: Scene, preset: Preset, time: float) -> FloatArray:
+    """(4, 4) world from LiDAR: level at its height above the ground, or riding as the preset's mounting says.
+
+    A car on uneven ground tilts with it; what its springs and load add is drawn anew every half second.
+    """
+    x, y, yaw = scene.ego.pose(time)
+    terrain, mounting = scene.site.terrain, preset.world.mounting
+    pose = np.eye(4)
+    pose[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
+    pose[:3, 3] = x, y, float(terrain.height(x, y)) + preset.lidar.height_m
+    if mounting is None:
+        return pose
+    before = np.floor(2 * time)
+    rides = [mounting.draw(np.random.default_rng([scene.look, int(before) + k])) for k in (0, 1)]
+    share = 2 * time - before
+    height = sum(w * ride[0] for w, ride in zip((1 - share, share), rides, strict=True))
+    up = sum(w * ride[1][2] for w, ride in zip((1 - share, share), rides, strict=True))
+    # the slope that the mounting adds, on top of the ground's own: both are small enough for their order not to matter
+    slant = level_from_tilted(terrain.normal(x, y)).T
+    pose[:3, :3] = slant @ pose[:3, :3] @ level_from_tilted(up / np.linalg.norm(up))
+    crown = scene.site.world.crown * max(scene.site.street.half_width - abs(scene.ego.offset), 0.0)
+    pose[:3, 3] += slant[:, 2] * (preset.lidar.height_m + height) - [0, 0, preset.lidar.height_m - crown]
+    return pose
 
 
 def lamp_positions(scene: Scene, around: float) -> NDArray[np.float64]:
@@ -319,7 +344,7 @@ def simulate_drive(
         raise ConfigError(f"seed and number must not be negative, got {seed} and {drive}")
     sensors = get_preset(preset) if isinstance(preset, str) else preset
     duration = (frames - 1) / sensors.rate_hz
-    scene = build_scene(np.random.default_rng([seed, drive]), sensors.layout, duration, street, density)
+    scene = build_scene(np.random.default_rng([seed, drive]), sensors.layout, duration, street, density, sensors.world)
     for number in range(first, frames):
         name = f"{drive:06d}" if frames == 1 else f"{drive:04d}_{number:06d}"
         yield capture(scene, sensors, number / sensors.rate_hz, (seed, drive, number), name, images, threads)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lcf3d.errors import ConfigError
+from lcf3d.simulation.worlds import PLAIN, RICH, World
 from lcf3d.structures import Camera
 
 Matrix = NDArray[np.float64]
@@ -29,6 +30,7 @@ class LidarSpec:
         height_m: above the ground.
         sensitivity: a beam returns with chance ``1 - exp(-4 sensitivity * reflected share / range^2)``.
         base_loss: share of beams lost for no visible reason.
+        uneven_beams: intensities with the zeros, low values and gains by beam of a real scanner.
     """
 
     elevations_deg: tuple[float, ...]
@@ -40,6 +42,7 @@ class LidarSpec:
     height_m: float
     sensitivity: float
     base_loss: float
+    uneven_beams: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +58,7 @@ class Preset:
         night: images by headlamps and street lamps.
         rate_hz: frames a second of a sequence.
         description: one line for the help.
+        world: what the streets hold beyond the ordinary.
     """
 
     name: str
@@ -65,6 +69,7 @@ class Preset:
     night: bool
     rate_hz: float
     description: str
+    world: World = PLAIN
 
     def resized(self, factor: float, steps: int | None = None) -> Preset:
         """The same preset with images scaled by ``factor`` and fewer LiDAR firings, for tests and previews."""
@@ -208,6 +213,11 @@ def _nuscenes_cameras() -> tuple[Camera, ...]:
     return tuple(cameras)
 
 
+def _train_kitti(kitti: Preset, name: str, description: str) -> Preset:
+    lidar = replace(kitti.lidar, uneven_beams=True)
+    return replace(kitti, name=name, lidar=lidar, world=RICH, description=description)
+
+
 @lru_cache(maxsize=1)
 def all_presets() -> dict[str, Preset]:
     """All presets by name."""
@@ -242,6 +252,12 @@ def all_presets() -> dict[str, Preset]:
         ),
         replace(kitti, name="sparse16", lidar=VLP16, description="kitti64 with a 16-beam LiDAR"),
         replace(kitti, name="rain", rain=0.7, description="kitti64 in rain: lost beams, droplets, wet road, haze"),
+        _train_kitti(
+            kitti, "train_kitti", "kitti64 to train on: many people and riders, hidden objects, uneven ground"
+        ),
+        _train_kitti(
+            replace(kitti, cameras=kitti.cameras[:1]), "train_mono", "train_kitti with the left camera only: quicker"
+        ),
         replace(kitti, name="night", night=True, description="kitti64 at night: head and street lamps"),
     )
     return {preset.name: preset for preset in every}

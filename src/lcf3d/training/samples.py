@@ -161,7 +161,9 @@ def _write_one(recipe: SampleRecipe, root: Path, index: int) -> int:
     preset = get_preset(recipe.preset)
     if recipe.scale != 1:
         preset = preset.resized(recipe.scale)
-    scene = build_scene(np.random.default_rng([recipe.seed, index]), preset.layout, 0.0, None, recipe.density)
+    scene = build_scene(
+        np.random.default_rng([recipe.seed, index]), preset.layout, 0.0, None, recipe.density, preset.world
+    )
     make = _scan_arrays if recipe.sensor == "lidar" else _image_arrays
     arrays = make(scene, preset, (recipe.seed, index, 0))
     with atomic_path(root / f"{index:06d}.npz") as temporary:
