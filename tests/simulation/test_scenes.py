@@ -142,7 +142,16 @@ def test_rain_loses_far_returns_and_night_darkens_images():
 
 def test_sparse_has_a_quarter_of_the_beams():
     assert len(get_preset("sparse16").lidar.elevations_deg) == 16
-    assert set(all_presets()) == {"kitti64", "mono64", "nuscenes32", "sparse16", "rain", "night"}
+    assert set(all_presets()) == {
+        "kitti64",
+        "mono64",
+        "nuscenes32",
+        "sparse16",
+        "rain",
+        "night",
+        "train_kitti",
+        "train_mono",
+    }
 
 
 def test_equal_seeds_give_equal_scenes_and_frames():
