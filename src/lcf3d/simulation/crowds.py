@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lcf3d.simulation.actors import Motion
 from lcf3d.simulation.roads import Path
@@ -19,17 +20,21 @@ That gives KITTI's mix of heights: 43 % of people over 100 pixels, 30 % from 50 
 """
 RIDERS_RANGE_M: Final = (6.0, 62.0)
 _BEHIND: Final = 0.22
-_PLACES: Final = ("walking", "group", "crossing", "parked", "door", "sitting", "yard")
-_PLACE_SHARES: Final = (0.33, 0.19, 0.15, 0.16, 0.04, 0.04, 0.09)
-_RIDES: Final = ("edge", "pavement", "crossing", "waiting", "abreast")
-_RIDE_SHARES: Final = (0.42, 0.18, 0.16, 0.10, 0.14)
+_PLACES: Final = ("walking", "group", "crossing", "parked", "door", "sitting", "yard", "hidden")
+_PLACE_SHARES: Final = (0.25, 0.18, 0.13, 0.14, 0.04, 0.04, 0.07, 0.15)
+_RIDES: Final = ("edge", "pavement", "crossing", "waiting", "abreast", "hidden")
+_RIDE_SHARES: Final = (0.34, 0.16, 0.13, 0.08, 0.14, 0.15)
 
 
-def add_crowds(crowd: Crowd, world: World) -> None:
-    """Add the queues, rows, riders, people and parked two-wheelers of ``world`` to a street."""
-    rng = crowd.rng
+def add_vehicles(crowd: Crowd, world: World) -> None:
+    """Add the queues and rows of ``world`` to a street, before its ordinary road users."""
     _queues(crowd, world)
     _rows(crowd, world)
+
+
+def add_people(crowd: Crowd, world: World) -> None:
+    """Add the riders, people and parked two-wheelers of ``world`` to a street, after all vehicles."""
+    rng = crowd.rng
     for _ in range(int(rng.poisson(world.riders))):
         _ride(crowd)
     for _ in range(int(rng.poisson(world.people / 1.5))):  # groups make one and a half of each
@@ -55,6 +60,38 @@ def _across(crowd: Crowd, s: float, start: float, speed: float) -> Motion:
     return Motion(line, 60.0 + start, 0.0, speed)
 
 
+def _behind(crowd: Crowd, speed: float, turn: float) -> Motion:
+    """Motion of somebody who is half hidden from the sensors by one of the road users already there."""
+    rng = crowd.rng
+    x, y, _ = crowd.ego.pose(crowd.duration / 2)
+    others = np.array([a.motion.pose(crowd.duration / 2) for a in crowd.actors]).reshape(-1, 3)
+    along, left, _ = _road_coordinates(crowd, others)
+    near = np.flatnonzero((along > 4) & (along < 38) & (np.abs(left) < 16))
+    if not len(near):
+        return Motion(crowd.site.path, crowd.site.travel / 2 + float(rng.uniform(8, 40)), 3.0, speed, turn)
+    chosen = int(rng.choice(near))
+    kind, (length, width, _) = crowd.actors[chosen].kind, crowd.actors[chosen].size
+    sight = others[chosen, :2] - [x, y]
+    sight /= np.linalg.norm(sight)
+    beyond = (width if kind in ("pedestrian", "cyclist") else float(rng.uniform(*sorted((width, length))))) / 2
+    aside = float(rng.normal(0, 0.25 + 0.3 * width))
+    place = (
+        others[chosen, :2] + sight * (beyond + float(rng.uniform(0.4, 3.0))) + aside * np.array([-sight[1], sight[0]])
+    )
+    s, offset = (float(v[0]) for v in _road_coordinates(crowd, np.array([[*place, 0.0]]))[:2])
+    return Motion(crowd.site.path, crowd.site.travel / 2 + s - speed * crowd.duration / 2, offset, speed, turn)
+
+
+def _road_coordinates(crowd: Crowd, places: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
+    """Arc length from the middle of the sensors' travel, metres left of it, heading, of (N, 3) poses."""
+    s = np.arange(crowd.site.first, crowd.site.last, 0.25)
+    x, y, heading = crowd.site.path.at(s)
+    nearest = np.argmin((places[:, 0, None] - x) ** 2 + (places[:, 1, None] - y) ** 2, axis=1)
+    dx, dy = places[:, 0] - x[nearest], places[:, 1] - y[nearest]
+    left = dy * np.cos(heading[nearest]) - dx * np.sin(heading[nearest])
+    return s[nearest] - crowd.site.travel / 2, left, places[:, 2] - heading[nearest]
+
+
 def _person(crowd: Crowd) -> None:
     """Somebody, or some people together, at one of the places where people are found."""
     rng, street = crowd.rng, crowd.site.street
@@ -74,6 +111,12 @@ def _person(crowd: Crowd) -> None:
     if place == "crossing":
         speed *= 0.9
         crowd.add("pedestrian", lambda: _across(crowd, s, float(rng.uniform(-1, 1)) * (edge + 1), speed), 0.05)
+        return
+    if place == "hidden":
+        facing = float(rng.uniform(-np.pi, np.pi))
+        crowd.add(
+            "pedestrian", lambda: _behind(crowd, 0.0 if facing > 0 else speed, facing if facing > 0 else 0.0), 0.02
+        )
         return
     spans = {
         "walking": (0.3, width),
@@ -121,6 +164,11 @@ def _ride(crowd: Crowd) -> None:
     speed = way * float(rng.uniform(2.5, 6.5))
     if ride == "crossing":
         crowd.add(kind, lambda: _across(crowd, s, float(rng.uniform(-1, 1)) * (street.half_width + 2), speed), 0.1)
+        return
+
+    if ride == "hidden":
+        turn = float(rng.choice([0.0, 0.0, np.pi / 2, -np.pi / 2]))
+        crowd.add(kind, lambda: _behind(crowd, 0.0 if turn else speed, turn), 0.05)
         return
 
     def motion(shift: float = 0.0) -> Motion:

@@ -11,21 +11,21 @@ from numpy.typing import NDArray
 from lcf3d.simulation.materials import MATERIALS, Kind
 
 _BY_KIND: Final[dict[Kind, tuple[float, float]]] = {
-    Kind.DIFFUSE: (0.04, 0.92),
-    Kind.PAINT: (0.46, 0.62),
+    Kind.DIFFUSE: (0.0, 1.15),
+    Kind.PAINT: (0.46, 0.70),
     Kind.GLASS: (0.50, 0.60),
-    Kind.ROAD: (0.02, 0.98),
-    Kind.GROUND: (0.03, 0.98),
-    Kind.FACADE: (0.14, 0.70),
+    Kind.ROAD: (0.02, 1.0),
+    Kind.GROUND: (0.0, 1.02),
+    Kind.FACADE: (0.10, 0.68),
     Kind.LAMP: (0.10, 0.90),
-    Kind.FOLIAGE: (0.08, 0.70),
+    Kind.FOLIAGE: (0.0, 0.70),
     Kind.METAL: (0.40, 0.75),
 }
 _BY_NAME: Final[dict[str, tuple[float, float]]] = {
     "rubber": (0.35, 1.3),
     "plastic": (0.35, 1.0),
-    "wall": (0.14, 0.70),
-    "brick": (0.14, 0.70),
+    "wall": (0.10, 0.68),
+    "brick": (0.10, 0.68),
     "roof": (0.15, 0.75),
     "concrete": (0.10, 0.75),
     "tarpaulin": (0.25, 0.75),
@@ -56,8 +56,8 @@ def respond(
         beams: number of beams; each has a gain of its own, drawn anew for every scan.
         rng: random numbers.
     """
-    faint = rng.random(beams) < 0.3
-    gains = np.where(faint, rng.uniform(0.3, 0.85, beams), rng.normal(0.97, 0.10, beams)) * rng.normal(1.0, 0.08)
+    faint = rng.random(beams) < 0.25
+    gains = np.where(faint, rng.uniform(0.15, 0.9, beams), rng.normal(1.03, 0.12, beams)) * rng.normal(1.0, 0.08)
     zero, factor = _table()[material].T
     value = intensity * factor * gains.clip(0.2, 1.3).astype(np.float32)[ring]
     dropped = rng.random(len(intensity), dtype=np.float32) < zero

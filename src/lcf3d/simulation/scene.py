@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from lcf3d.errors import ConfigError
 from lcf3d.geometry.boxes import bev_corners
 from lcf3d.simulation.actors import Actor, Motion
-from lcf3d.simulation.crowds import add_crowds
+from lcf3d.simulation.crowds import add_people, add_vehicles
 from lcf3d.simulation.materials import MATERIAL_ID
 from lcf3d.simulation.meshes.primitives import Mesh
 from lcf3d.simulation.obstacles import ObstacleMap
@@ -173,8 +173,10 @@ def build_scene(
     obstacles = ObstacleMap(static, terrain, (x.min() - reach, y.min() - reach), (x.max() + reach, y.max() + reach))
     crowd = Crowd(site, obstacles, dataset, duration, rng, ego, world.large)
     if world != PLAIN:
-        add_crowds(crowd, world)
+        add_vehicles(crowd, world)
     populate(crowd, density * world.density)
+    if world != PLAIN:
+        add_people(crowd, world)
     cloudiness = float(np.clip(rng.beta(1.1, 1.6), 0, 1))
     azimuth, elevation = rng.uniform(-np.pi, np.pi), np.radians(rng.uniform(24, 58))
     sun = np.array([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)])

@@ -23,8 +23,8 @@ class Mounting:
     """
 
     height_m: tuple[float, float] = (-0.03, 0.05)
-    ahead: tuple[float, float] = (0.0075, 0.007)
-    left: tuple[float, float] = (-0.006, 0.013)
+    ahead: tuple[float, float] = (0.0075, 0.008)
+    left: tuple[float, float] = (-0.006, 0.015)
 
     def draw(self, rng: np.random.Generator) -> tuple[float, NDArray[np.float64]]:
         """Height to add in metres, and (3, 3) rotation into the car's level frame from the LiDAR's."""
@@ -84,14 +84,14 @@ PLAIN: Final = World()
 """Streets with KITTI's mix of road users on almost flat ground."""
 RICH: Final = World(
     density=1.15,
-    people=4.5,
+    people=6.0,
     riders=2.0,
     two_wheelers=1.5,
     queues=0.3,
     rows=0.8,
     large=1.6,
     clutter=14.0,
-    relief_m=0.7,
+    relief_m=0.9,
     crown=0.02,
     mounting=Mounting(),
 )
