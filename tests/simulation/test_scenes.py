@@ -151,6 +151,7 @@ def test_sparse_has_a_quarter_of_the_beams():
         "night",
         "train_kitti",
         "train_mono",
+        "train_nuscenes",
     }
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lcf3d.errors import ConfigError
-from lcf3d.simulation.worlds import PLAIN, RICH, World
+from lcf3d.simulation.worlds import PLAIN, RICH, Mounting, World
 from lcf3d.structures import Camera
 
 Matrix = NDArray[np.float64]
@@ -213,9 +213,9 @@ def _nuscenes_cameras() -> tuple[Camera, ...]:
     return tuple(cameras)
 
 
-def _train_kitti(kitti: Preset, name: str, description: str) -> Preset:
-    lidar = replace(kitti.lidar, uneven_beams=True)
-    return replace(kitti, name=name, lidar=lidar, world=RICH, description=description)
+def _to_train_on(preset: Preset, name: str, description: str, world: World = RICH) -> Preset:
+    lidar = replace(preset.lidar, uneven_beams=True)
+    return replace(preset, name=name, lidar=lidar, world=world, description=description)
 
 
 @lru_cache(maxsize=1)
@@ -252,11 +252,17 @@ def all_presets() -> dict[str, Preset]:
         ),
         replace(kitti, name="sparse16", lidar=VLP16, description="kitti64 with a 16-beam LiDAR"),
         replace(kitti, name="rain", rain=0.7, description="kitti64 in rain: lost beams, droplets, wet road, haze"),
-        _train_kitti(
+        _to_train_on(
             kitti, "train_kitti", "kitti64 to train on: many people and riders, hidden objects, uneven ground"
         ),
-        _train_kitti(
+        _to_train_on(
             replace(kitti, cameras=kitti.cameras[:1]), "train_mono", "train_kitti with the left camera only: quicker"
+        ),
+        _to_train_on(
+            nuscenes,
+            "train_nuscenes",
+            "nuscenes32 to train on: many people and riders, uneven ground",
+            replace(RICH, mounting=Mounting((0.0, 0.03), (0.0, 0.006), (0.0, 0.008))),
         ),
         replace(kitti, name="night", night=True, description="kitti64 at night: head and street lamps"),
     )

@@ -128,7 +128,9 @@ def _clutter(site: Site, rng: np.random.Generator) -> list[Mesh]:
         if site.near_crossing(s, 1.0):
             continue
         aside = float(rng.uniform(0.35, width)) if rng.random() < 0.7 else width + float(rng.exponential(4.0))
-        parts.append(_place(site, thing(rng), s, site.street.half_width + aside, float(rng.choice([-1.0, 1.0])), KERB))
+        lift = KERB if aside < site.street.pavement else -0.06  # grass and earth lie lower than the pavement
+        side = float(rng.choice([-1.0, 1.0]))
+        parts.append(_place(site, thing(rng), s, site.street.half_width + aside, side, lift))
     return parts
 
 
