@@ -42,7 +42,7 @@ def _trunk(rng: np.random.Generator) -> Mesh:
     lean, radius = rng.normal(0, 0.12, 2), float(rng.uniform(0.08, 0.28))
     height = float(rng.uniform(2.6, 5.0))
     top = np.array([lean[0], lean[1], 1.0]) * height
-    parts = [tube([(0, 0, -0.1), top / 2, top], [radius * 1.2, radius, radius * 0.75], "bark", (0.10, 0.075, 0.05), 9)]
+    parts = [tube([np.zeros(3), top / 2, top], [radius * 1.2, radius, radius * 0.75], "bark", (0.10, 0.075, 0.05), 9)]
     if rng.random() < 0.4:
         fork = top * 0.55 + np.array([*rng.normal(0, 0.5, 2), height * 0.5])
         parts.append(tube([top * 0.5, fork], [radius * 0.6, radius * 0.4], "bark", (0.10, 0.075, 0.05), 7))

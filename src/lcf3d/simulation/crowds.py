@@ -73,7 +73,9 @@ def _behind(crowd: Crowd, speed: float, turn: float) -> Motion:
     kind, (length, width, _) = crowd.actors[chosen].kind, crowd.actors[chosen].size
     sight = others[chosen, :2] - [x, y]
     sight /= np.linalg.norm(sight)
-    beyond = (width if kind in ("pedestrian", "cyclist") else float(rng.uniform(*sorted((width, length))))) / 2
+    beyond = (
+        width if kind in ("pedestrian", "cyclist") else float(rng.uniform(min(width, length), max(width, length)))
+    ) / 2
     aside = float(rng.normal(0, 0.25 + 0.3 * width))
     place = (
         others[chosen, :2] + sight * (beyond + float(rng.uniform(0.4, 3.0))) + aside * np.array([-sight[1], sight[0]])

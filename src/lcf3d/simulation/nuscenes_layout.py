@@ -145,8 +145,9 @@ def write_tables(root: Path, ids: Iterable[str], seed: int) -> None:
         _drive_tables(tables, seed, drive, members)
     write_png(root / "maps" / "placeholder.png", np.zeros((4, 4, 3), dtype=np.uint8))
     names = [scene["name"] for scene in tables["scene"]]
+    every = min(VAL_EVERY, max(2, len(names)))
     for name, is_val in (("train", False), ("val", True)):
-        chosen = [n for k, n in enumerate(names) if (k % VAL_EVERY == VAL_EVERY - 1) == is_val]
+        chosen = [n for k, n in enumerate(names) if (k % every == every - 1) == is_val]
         write_text(root / f"{name}.txt", "".join(f"{n}\n" for n in chosen))
     for table, rows in tables.items():
         write_json(root / VERSION / f"{table}.json", rows, indent=0)
