@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -19,7 +19,8 @@ from lcf3d.simulation.camera import Render, Stage, measure_exposure, render
 from lcf3d.simulation.labels import MAX_HIDDEN, Sightings, kitti_objects, sight
 from lcf3d.simulation.lidar import Scan, scan
 from lcf3d.simulation.light import make_light
-from lcf3d.simulation.presets import Preset, get_preset
+from lcf3d.simulation.photo import NEUTRAL, Photo, draw_photo
+from lcf3d.simulation.presets import KITTI_SIZE, Preset, get_preset
 from lcf3d.simulation.rays import RayTracer
 from lcf3d.simulation.scene import Scene, build_scene
 from lcf3d.simulation.worlds import level_from_tilted
@@ -224,14 +225,17 @@ def _look(
     map_: Callable[..., Iterable[tuple[Render, Sightings]]],
 ) -> dict[str, tuple[Render, Sightings]]:
     """Image and sightings of the cameras of those numbers, by name."""
-    corners = [stage.mesh.corners[stage.owner == actor.id] for actor in scene.actors]
+    first = np.searchsorted(stage.owner, [actor.id for actor in scene.actors])  # actors follow one another
+    last = np.searchsorted(stage.owner, [actor.id for actor in scene.actors], side="right")
+    corners = [stage.mesh.corners[a:b] for a, b in zip(first, last, strict=True)]
     shared = measure_exposure(preset.cameras[0], stage)
+    photo = _photo(scene, preset)
 
     def one(number: int) -> tuple[Render, Sightings]:
         camera: Camera = preset.cameras[number]
         rng = np.random.default_rng([*seed, 2, number])
         exposure = shared if preset.layout == "kitti" else measure_exposure(camera, stage)
-        picture = render(camera, stage, rng, exposure)
+        picture = render(camera, stage, rng, exposure, photo)
         return picture, sight(camera, picture.owner, scene.actors, corners, boxes, stage.world_from_lidar)
 
     return dict(zip((preset.cameras[number].name for number in numbers), map_(one, numbers), strict=True))
@@ -245,7 +249,18 @@ def make_stage(scene: Scene, preset: Preset, time: float) -> Stage:
     light = make_light(
         scene.sun, scene.cloudiness, scene.haze_m, scene.look, preset.rain, preset.night, lamp_positions(scene, x)
     )
+    shade = _photo(scene, preset).shade
+    if shade != 1:
+        light = replace(light, sky_ambient=light.sky_ambient * shade, ground_ambient=light.ground_ambient * shade)
     return Stage(RayTracer(snapshot.mesh.corners), snapshot.mesh, snapshot.owner, light, scene.site.markings(), pose)
+
+
+def _photo(scene: Scene, preset: Preset) -> Photo:
+    """The look of a drive's images."""
+    if not preset.world.varied_photos:
+        return NEUTRAL
+    scale = preset.cameras[0].width / KITTI_SIZE[0] if preset.layout == "kitti" else 1.0
+    return draw_photo(np.random.default_rng([scene.look, 9]), scale)
 
 
 def sensor_pose(scene: Scene, preset: Preset, time: float) -> FloatArray:

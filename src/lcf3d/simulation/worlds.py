@@ -59,6 +59,7 @@ class World:
         clutter: mean number of posts, trunks, cabinets, bushes and walls put beside the road around the sensors.
         relief_m: height of the rolling of the land; 0 keeps the gentle default.
         crown: fall of the carriageway from its middle to its edges, as a slope.
+        varied_photos: exposure, contrast, colours, sharpness and depth of the shade drawn anew for every drive.
         mounting: how the sensors ride, None for always level.
     """
 
@@ -72,6 +73,7 @@ class World:
     clutter: float = 0.0
     relief_m: float = 0.0
     crown: float = 0.0
+    varied_photos: bool = False
     mounting: Mounting | None = None
 
     @property
@@ -93,6 +95,7 @@ RICH: Final = World(
     clutter=14.0,
     relief_m=0.9,
     crown=0.02,
+    varied_photos=True,
     mounting=Mounting(),
 )
 """Streets to train on: several times as many people and riders, things mistaken for them, uneven ground."""
