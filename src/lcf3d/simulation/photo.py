@@ -80,11 +80,12 @@ def _softened(channel: Floats, blur_px: float, shift_px: float) -> Floats:
     down = np.exp(-0.5 * (offsets / max(blur_px, 0.3)) ** 2)
     result = channel
     for axis, kernel in ((0, down), (1, across)):
+        kernel = np.where(kernel > 2e-3 * kernel.sum(), kernel, 0.0)
         weights = (kernel / kernel.sum()).astype(np.float32)
         pad = [(reach, reach) if a == axis else (0, 0) for a in (0, 1)]
         padded, length = np.pad(result, pad, mode="edge"), channel.shape[axis]
         total = np.zeros_like(channel)
-        for k in np.flatnonzero(weights > 1e-3).tolist():
+        for k in np.flatnonzero(weights).tolist():
             total += weights[k] * (padded[k : k + length] if axis == 0 else padded[:, k : k + length])
         result = total
     return result
