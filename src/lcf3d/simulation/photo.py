@@ -76,7 +76,7 @@ def _softened(channel: Floats, blur_px: float, shift_px: float) -> Floats:
     """An (H, W) channel blurred and shifted sideways, by a small separable kernel."""
     reach = 3
     offsets = np.arange(-reach, reach + 1)
-    across = np.exp(-0.5 * ((offsets - shift_px) / max(blur_px, 0.3)) ** 2)
+    across = np.exp(-0.5 * ((offsets + shift_px) / max(blur_px, 0.3)) ** 2)
     down = np.exp(-0.5 * (offsets / max(blur_px, 0.3)) ** 2)
     result = channel
     for axis, kernel in ((0, down), (1, across)):
