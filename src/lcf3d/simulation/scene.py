@@ -171,7 +171,7 @@ def build_scene(
     x, y, _ = path.at(np.array([first, 0.0, last / 2, last]))
     reach = 60.0
     obstacles = ObstacleMap(static, terrain, (x.min() - reach, y.min() - reach), (x.max() + reach, y.max() + reach))
-    crowd = Crowd(site, obstacles, dataset, duration, rng, ego, world.large)
+    crowd = Crowd(site, obstacles, dataset, duration, rng, ego, world.large, world.varied_people)
     if world != PLAIN:
         add_vehicles(crowd, world)
     populate(crowd, density * world.density)

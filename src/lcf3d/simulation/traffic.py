@@ -32,6 +32,7 @@ class Crowd:
         rng: random numbers.
         ego: how the sensors' car moves.
         large: factor on the share of vehicles that are no cars.
+        varied: people with clothes and a gait of their own.
         actors: what has been placed.
         refused: how many could not be placed.
     """
@@ -43,6 +44,7 @@ class Crowd:
     rng: np.random.Generator
     ego: Motion
     large: float = 1.0
+    varied: bool = False
     actors: list[Actor] = field(default_factory=list)
     refused: int = 0
 
@@ -80,7 +82,7 @@ class Crowd:
             if self._is_clear(m, size, track, margin):
                 fine = bool(np.linalg.norm(track[:, 0, :2] - self._ego_track[:, 0, :2], axis=1).min() < 40.0)
                 id = len(self.actors) + 1
-                self.actors.append(make_actor(id, kind, m, self.rng, self.dataset, size, stopped, fine))
+                self.actors.append(make_actor(id, kind, m, self.rng, self.dataset, size, stopped, fine, self.varied))
                 self._discs = np.concatenate([self._discs, track], axis=1)
                 return True
         self.refused += 1

@@ -59,6 +59,7 @@ class World:
         clutter: mean number of posts, trunks, cabinets, bushes and walls put beside the road around the sensors.
         relief_m: height of the rolling of the land; 0 keeps the gentle default.
         crown: fall of the carriageway from its middle to its edges, as a slope.
+        varied_people: everybody with clothes, posture and a gait of their own.
         varied_photos: exposure, contrast, colours, sharpness and depth of the shade drawn anew for every drive.
         mounting: how the sensors ride, None for always level.
     """
@@ -73,6 +74,7 @@ class World:
     clutter: float = 0.0
     relief_m: float = 0.0
     crown: float = 0.0
+    varied_people: bool = False
     varied_photos: bool = False
     mounting: Mounting | None = None
 
@@ -95,6 +97,7 @@ RICH: Final = World(
     clutter=14.0,
     relief_m=0.9,
     crown=0.02,
+    varied_people=True,
     varied_photos=True,
     mounting=Mounting(),
 )
