@@ -166,6 +166,7 @@ def test_sparse_has_a_quarter_of_the_beams():
         "kitti64",
         "mono64",
         "nuscenes32",
+        "nuscenes_sweeps",
         "sparse16",
         "rain",
         "night",

@@ -103,6 +103,19 @@ class SimulatedFrame:
         )
 
     @property
+    def cameras(self) -> tuple[Camera, ...]:
+        """The preset's cameras; those that fire at a time of their own are where the car has carried them by then."""
+        moved = []
+        for number, camera in enumerate(self.preset.cameras):
+            delay = self.preset.delay(number)
+            if delay:
+                later = sensor_pose(self.scene, self.preset, self.time + delay)
+                later_from_now = invert_rigid(later[None])[0] @ self.world_from_lidar
+                camera = replace(camera, camera_from_lidar=camera.camera_from_lidar @ later_from_now)
+            moved.append(camera)
+        return tuple(moved)
+
+    @property
     def frame(self) -> Frame:
         """The frame as detectors and the fusion take it."""
         images = {name: r.image for name, r in self.renders.items()}
@@ -110,7 +123,7 @@ class SimulatedFrame:
         if self.preset.layout == "nuscenes":
             points = points * np.array([1, 1, 1, 255], dtype=np.float32)
         labels = self.labels if self.renders or self.preset.layout == "nuscenes" else None
-        return Frame(self.id, points, self.preset.cameras, images, labels)
+        return Frame(self.id, points, self.cameras, images, labels)
 
     def detections_2d(self, camera: str) -> Detections2D:
         """What a perfect camera detector finds in an image: the labelled objects with visible boxes and masks.
@@ -181,7 +194,7 @@ def capture(
     with ThreadPoolExecutor(max(1, threads)) as pool:
         turning = pool.submit(scan, preset.lidar, stage, scene.ego.velocity(time), preset.rain, sensor)
         if images:
-            seen = _look(scene, preset, stage, boxes, seed, range(len(preset.cameras)), pool.map)
+            seen = _look(scene, preset, time, stage, seed, range(len(preset.cameras)), pool.map)
         turn = turning.result()
     points_on = np.zeros(len(boxes), dtype=np.int64)
     near = np.flatnonzero(np.hypot(boxes[:, 0], boxes[:, 1]) < preset.lidar.max_range_m + 12.0)
@@ -210,33 +223,34 @@ def look(
         MissingExtraError: embreex is not installed.
     """
     stage = make_stage(scene, preset, time)
-    boxes = transform_boxes(scene.boxes(time), invert_rigid(stage.world_from_lidar[None])[0])
     wanted = [number for number, camera in enumerate(preset.cameras) if camera in cameras]
-    return _look(scene, preset, stage, boxes, seed, wanted, map)
+    return _look(scene, preset, time, stage, seed, wanted, map)
 
 
 def _look(
     scene: Scene,
     preset: Preset,
+    time: float,
     stage: Stage,
-    boxes: FloatArray,
     seed: tuple[int, ...],
     numbers: Sequence[int],
     map_: Callable[..., Iterable[tuple[Render, Sightings]]],
 ) -> dict[str, tuple[Render, Sightings]]:
-    """Image and sightings of the cameras of those numbers, by name."""
-    first = np.searchsorted(stage.owner, [actor.id for actor in scene.actors])  # actors follow one another
-    last = np.searchsorted(stage.owner, [actor.id for actor in scene.actors], side="right")
-    corners = [stage.mesh.corners[a:b] for a, b in zip(first, last, strict=True)]
+    """Image and sightings of the cameras of those numbers, by name; ``stage`` is that of ``time``."""
     shared = measure_exposure(preset.cameras[0], stage)
     photo = _photo(scene, preset)
 
     def one(number: int) -> tuple[Render, Sightings]:
-        camera: Camera = preset.cameras[number]
+        camera, delay = preset.cameras[number], preset.delay(number)
+        now = make_stage(scene, preset, time + delay) if delay else stage
+        boxes = transform_boxes(scene.boxes(time + delay), invert_rigid(now.world_from_lidar[None])[0])
         rng = np.random.default_rng([*seed, 2, number])
-        exposure = shared if preset.layout == "kitti" else measure_exposure(camera, stage)
-        picture = render(camera, stage, rng, exposure, photo)
-        return picture, sight(camera, picture.owner, scene.actors, corners, boxes, stage.world_from_lidar)
+        exposure = shared if preset.layout == "kitti" else measure_exposure(camera, now)
+        picture = render(camera, now, rng, exposure, photo)
+        ids = [actor.id for actor in scene.actors]  # the triangles of an actor follow one another
+        first, last = (np.searchsorted(now.owner, ids, side=side) for side in ("left", "right"))
+        corners = [now.mesh.corners[a:b] for a, b in zip(first, last, strict=True)]
+        return picture, sight(camera, picture.owner, scene.actors, corners, boxes, now.world_from_lidar)
 
     return dict(zip((preset.cameras[number].name for number in numbers), map_(one, numbers), strict=True))
 

@@ -59,6 +59,8 @@ class Preset:
         rate_hz: frames a second of a sequence.
         description: one line for the help.
         world: what the streets hold beyond the ordinary.
+        camera_delays_s: when each camera fires, in seconds after the middle of the LiDAR's turn; empty for all at once.
+        sweeps: scans before every key frame but a drive's first that are written with it (nuScenes layout).
     """
 
     name: str
@@ -70,6 +72,12 @@ class Preset:
     rate_hz: float
     description: str
     world: World = PLAIN
+    camera_delays_s: tuple[float, ...] = ()
+    sweeps: int = 0
+
+    def delay(self, number: int) -> float:
+        """Seconds after the middle of the LiDAR's turn at which a camera fires."""
+        return self.camera_delays_s[number] if self.camera_delays_s else 0.0
 
     def resized(self, factor: float, steps: int | None = None) -> Preset:
         """The same preset with images scaled by ``factor`` and fewer LiDAR firings, for tests and previews."""
@@ -257,6 +265,13 @@ def all_presets() -> dict[str, Preset]:
         ),
         _to_train_on(
             replace(kitti, cameras=kitti.cameras[:1]), "train_mono", "train_kitti with the left camera only: quicker"
+        ),
+        replace(
+            nuscenes,
+            name="nuscenes_sweeps",
+            camera_delays_s=tuple(-yaw / 360 / HDL32.rate_hz for _, _, yaw, _ in NUSCENES_CAMERAS),
+            sweeps=9,
+            description="nuscenes32 with nine sweeps before a key frame, cameras that fire as the LiDAR passes them",
         ),
         _to_train_on(
             nuscenes,
