@@ -45,7 +45,7 @@ class CompactNetwork(nn.Module):
         """
         width, height = grid or (self.width, self.height)
         canvas = scatter_pillars(self.voxel_encoder(features), cells, height, width, scans)
-        if self.training:
+        if self.training and canvas.device.type == "cpu":
             # gradients of convolutions are quicker with the channels outermost, the convolutions themselves innermost
             canvas = canvas.contiguous()
         maps: Sequence[Any] = self.bbox_head(self.neck(self.backbone(canvas)))
