@@ -266,13 +266,14 @@ class ArrivingLocalizer:
     def refresh(self) -> int:
         """Cut frustums from the scans that have come; gives the number of scans."""
         new = self.arrivals.take(6)
-        each(new, lambda path: self.pool.extend(self._frustums(path, self.seed)))
+        each(new, lambda path: self.pool.extend(self.frustums(path, self.seed)))
         self.scans += len(new)
         if new and any(not f.empty for f in self.pool):
             self.task = LocalizerTask(self.spec, self.pool, [], self.batch_size, self.augmentation, self.shares)
         return self.scans if self.task is not None else 0
 
-    def _frustums(self, path: Path, seed: int) -> list[PooledFrustum]:
+    def frustums(self, path: Path, seed: int) -> list[PooledFrustum]:
+        """Frustums of a sample, looked at from several headings."""
         rng = np.random.default_rng([seed, int(path.stem)])
         scenes = scenes_of_samples([path], self.cameras, self.views, int(rng.integers(2**31)))
         return [frustum for scene in scenes for frustum in frustums_of(scene, self.labels, rng)]
@@ -284,8 +285,20 @@ class ArrivingLocalizer:
 
     def check(self, network: Any) -> dict[str, float]:
         """Mean 3D IoU by class on held-out scans."""
-        held_out = [f for path in self.arrivals.held_out()[:20] for f in self._frustums(path, self.seed + 1)]
+        held_out = [f for path in self.arrivals.held_out()[:20] for f in self.frustums(path, self.seed + 1)]
         if not any(not f.empty for f in held_out):
             return {}
         task = LocalizerTask(self.spec, held_out, held_out, self.batch_size)
         return {name: value for name, value in task.validate(network).items() if name.endswith(" IoU") and "m IoU" not in name}
+
+
+def localizer_of(classes: str, folder: Path, batch_size: int) -> ArrivingLocalizer:
+    """The task of the localizer of ``kitti`` or ``nuscenes`` classes, by its recipe."""
+    from lcf3d.localizers.spec import LocalizerSpec
+    from lcf3d.training.recipes import recipe_of, training_cameras
+
+    recipe, spec = recipe_of(classes), LocalizerSpec.of("v1", classes)
+    labels = {name: k for k, name in enumerate(spec.class_names)}
+    labels |= {other: labels[name] for other, name in recipe.synonyms.items()}
+    cameras = training_cameras(recipe)
+    return ArrivingLocalizer(folder, spec, labels, cameras, recipe.views, dict(recipe.shares), batch_size)
