@@ -70,6 +70,7 @@ def main() -> None:
     parser.add_argument("--trainings", default=",".join(TRAININGS), help=f"of {', '.join(TRAININGS)}")
     parser.add_argument("--batch", type=float, default=1.0, help="factor on the batch sizes, for small machines")
     parser.add_argument("--needed", type=int, default=100, help="samples that a training waits for")
+    parser.add_argument("--weights-only", action="store_true", help="put no ONNX files into OUT")
     parser.add_argument("--begin", type=float, default=0.0, help=argparse.SUPPRESS)
     parser.add_argument("--role", default="", help=argparse.SUPPRESS)
     parser.add_argument("--number", type=int, default=0, help=argparse.SUPPRESS)
@@ -91,14 +92,14 @@ def conduct(options: argparse.Namespace) -> None:
         raise SystemExit(f"--trainings takes {', '.join(TRAININGS)}, got {unknown[0]!r}")
     options.out.mkdir(parents=True, exist_ok=True)
     options.jobs = options.jobs or max(1, (os.cpu_count() or 1) - 4)
-    options.device = options.device or _device()
     with tempfile.TemporaryDirectory() as temporary:
         options.work = options.work or Path(temporary)
         for folder in SEEDS:
             (options.work / folder).mkdir(parents=True, exist_ok=True)
         (options.work / "logs").mkdir(exist_ok=True)
-        say(options, f"{options.jobs} simulating processes, trainings on {options.device}, {options.minutes:g} minutes")
         running = {f"simulate{k}": _start(options, "simulate", k) for k in range(options.jobs)}
+        options.device = options.device or _device()
+        say(options, f"{options.jobs} simulating processes, trainings on {options.device}, {options.minutes:g} minutes")
         trainings = {name: _start(options, name) for name in options.trainings.split(",")}
         try:
             _watch(options, plan, running, trainings)
@@ -138,14 +139,15 @@ def _start(options: argparse.Namespace, role: str, number: int = 0) -> subproces
     """One of the processes of this script, with its output in a file."""
     command = [sys.executable, __file__, "--role", role, "--number", str(number)]
     for name in ("out", "minutes", "work", "device", "jobs", "batch", "needed", "begin"):
-        command += [f"--{name}", repr(value) if isinstance(value := getattr(options, name), float) else str(value)]
-    threads = {name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")}
+        value = getattr(options, name)
+        command += [f"--{name}={value!r}" if isinstance(value, float) else f"--{name}={value}"]
+    command += ["--weights-only"] if options.weights_only else []
+    threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
     source = str(Path(__file__).parents[1] / "src")
     path = os.pathsep.join([source, *filter(None, [os.environ.get("PYTHONPATH")])])
     environment = {**os.environ, **threads, "PYTHONUNBUFFERED": "1", "PYTHONPATH": path}
     if role == "simulate":
         environment["CUDA_VISIBLE_DEVICES"] = ""
-        command = ["nice", "-n", "10", *command]
     suffix = number if role == "simulate" else ""
     with (options.work / "logs" / f"{role}{suffix}.txt").open("ab") as log:
         return subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, env=environment)
@@ -195,6 +197,7 @@ def _device() -> str:
 
 def simulate(options: argparse.Namespace) -> None:
     """Write samples until it is time to stop."""
+    os.nice(10)
     from lcf3d.simulation.presets import all_presets
     from lcf3d.training.samples import SampleRecipe, write_scene_samples
 
@@ -224,10 +227,10 @@ def simulate(options: argparse.Namespace) -> None:
 
 def train(options: argparse.Namespace) -> None:
     """One of the trainings, from its first sample to its finished file."""
+    import torch
+
     from lcf3d.training.clocked import ClockSettings, train_by_clock
     from lcf3d.training.finishing import FINISHERS
-
-    import torch
 
     plan, name = Plan.of(options.begin, options.minutes), options.role
     torch.set_num_threads(1)
@@ -240,7 +243,8 @@ def train(options: argparse.Namespace) -> None:
     print(f"training begins after {time.time() - plan.begin:.0f} s", flush=True)
     network = train_by_clock(task, settings, plan.train_until, options.out / f"{name}.pt", options.device, _print)
     torch.set_num_threads(4)
-    figures = FINISHERS[name](network.cpu(), task.arrivals.held_out(), options.out, plan.finish_until - START_S)
+    out = options.work if options.weights_only else options.out
+    figures = FINISHERS[name](network.cpu(), task.arrivals.held_out(), out, plan.finish_until - START_S)
     (options.work / f"{name}.json").write_text(json.dumps(figures, indent=1))
     print(json.dumps(figures), flush=True)
 

@@ -99,9 +99,11 @@ def test_an_image_without_objects_teaches_low_scores_only() -> None:
 
 def test_images_of_a_batch_do_not_see_each_other() -> None:
     one, two = targets([[16, 8, 32, 24]], [0]), targets([[40, 4, 50, 28]], [1])
-    both = Targets(*(torch.cat([getattr(one, n), getattr(two, n)]) for n in ("boxes", "visible", "labels", "owner", "numbers")))
+    tables = ("boxes", "visible", "labels", "owner", "numbers")
+    both = Targets(*(torch.cat([getattr(one, name), getattr(two, name)]) for name in tables))
     single = outputs()
-    pair = SmallOutputs(*(torch.cat([getattr(single, n)] * 2) for n in ("logits", "boxes", "coefficients", "prototypes")))
+    maps = ("logits", "boxes", "coefficients", "prototypes")
+    pair = SmallOutputs(*(torch.cat([getattr(single, name)] * 2) for name in maps))
     centres = cell_centres(SIZE, torch.zeros(1))
     together = assign(pair, both, centres)
     for row, alone in enumerate((one, two)):

@@ -36,7 +36,12 @@ def test_targets_equal_those_of_a_single_scan():
     from lcf3d.training.lidar_targets import center_targets
 
     boxes = np.array(
-        [[20, 0, -1, 4, 1.8, 1.5, 0.3], [20.9, 1.5, -1, 0.8, 0.6, 1.7, 1], [50, -20, -1, 10, 2.5, 3, 2], [90, 0, 0, 4, 2, 2, 0.0]]
+        [
+            [20, 0, -1, 4, 1.8, 1.5, 0.3],
+            [20.9, 1.5, -1, 0.8, 0.6, 1.7, 1],
+            [50, -20, -1, 10, 2.5, 3, 2],
+            [90, 0, 0, 4, 2, 2, 0.0],
+        ]
     )
     labels = np.array([0, 1, -2, 0])
     single = center_targets(boxes, labels, COMPACT_KITTI)

@@ -178,8 +178,8 @@ def ground_field(points: NDArray[np.floating], area: tuple[float, float, float, 
 def _fit_nodes(grid, low, counts, expected):  # type: ignore[no-untyped-def]
     """(I, J, 3) planes at the nodes, each expected to go on from the node beside it that is nearer the sensor."""
     planes = np.empty((counts[0], counts[1], 3))
-    middle_x = min(max(int(round(-low[0] / FIELD_STEP)), 0), counts[0] - 1)
-    middle_y = min(max(int(round(-low[1] / FIELD_STEP)), 0), counts[1] - 1)
+    middle_x = min(max(int(np.rint(-low[0] / FIELD_STEP)), 0), counts[0] - 1)
+    middle_y = min(max(int(np.rint(-low[1] / FIELD_STEP)), 0), counts[1] - 1)
     for ring in range(max(counts[0], counts[1])):
         for i in range(max(middle_x - ring, 0), min(middle_x + ring + 1, counts[0])):
             for j in range(max(middle_y - ring, 0), min(middle_y + ring + 1, counts[1])):

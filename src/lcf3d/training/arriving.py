@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import threading
+import time
+from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +14,12 @@ import numpy as np
 from lcf3d.detectors.lidar.config import LidarConfig
 from lcf3d.errors import FormatError
 from lcf3d.training.camera_appearance import Appearance, changed_look
-from lcf3d.training.camera_images import from_sample
+from lcf3d.training.camera_images import LabelledImage, from_sample
 from lcf3d.training.camera_store import DeviceViews, ImageStore, draw_views
 from lcf3d.training.clocked import mixed
 from lcf3d.training.frustum_batch import Augmentation
 from lcf3d.training.frustums import PooledFrustum, frustums_of, scenes_of_samples
-from lcf3d.training.lidar_scans import labelled_scan, levelled_scan
+from lcf3d.training.lidar_scans import LabelledScan, labelled_scan, levelled_scan
 from lcf3d.training.lidar_store import DeviceAugmentation, ScanStore, beam_of, changed_scans
 from lcf3d.training.lidar_targets import center_losses
 from lcf3d.training.lidar_tensors import statistics_of, targets_of
@@ -27,8 +29,8 @@ from lcf3d.training.samples import read_image, read_scan
 
 HELD_OUT_EVERY = 16
 """Of so many samples the last is held out, by its number."""
-AT_ONCE = 80
-"""Samples taken between two steps at most, so that the device does not wait long."""
+CHECKED = 60
+"""Held-out samples that a training is checked with on its way."""
 
 
 def is_held_out(path: Path) -> bool:
@@ -36,36 +38,50 @@ def is_held_out(path: Path) -> bool:
     return int(path.stem) % HELD_OUT_EVERY == HELD_OUT_EVERY - 1
 
 
-@dataclass
 class Arrivals:
-    """The samples of a folder, in the order in which they arrive.
+    """The samples of a folder, read and prepared by a thread in the order in which they arrive.
 
-    Attributes:
+    Args:
         folder: where they are written, each whole at once.
-        seen: names of those that were taken.
+        prepare: makes of a path what is learned from; a sample that it cannot read is reported and passed over.
+        report: takes lines about such samples.
     """
 
-    folder: Path
-    seen: set[str] = field(default_factory=set)
+    def __init__(self, folder: Path, prepare: Callable[[Path], Any], report: Callable[[str], None] = print) -> None:
+        self.folder, self.prepare, self.report = folder, prepare, report
+        self._ready: deque[Any] = deque()
+        self._thread: threading.Thread | None = None
 
-    def take(self, most: int = AT_ONCE) -> list[Path]:
-        """New samples to learn from, at most so many."""
-        new = [p for p in sorted(self.folder.glob("*.npz")) if p.name not in self.seen and not is_held_out(p)][:most]
-        self.seen |= {p.name for p in new}
-        return new
+    def take(self) -> list[Any]:
+        """What has become ready since the last call."""
+        if self._thread is None:
+            self._thread = threading.Thread(target=self._read, daemon=True)
+            self._thread.start()
+        return [self._ready.popleft() for _ in range(len(self._ready))]
 
     def held_out(self) -> list[Path]:
         """The held-out samples that are there."""
         return [p for p in sorted(self.folder.glob("*.npz")) if is_held_out(p)]
 
+    def _read(self) -> None:
+        seen: set[str] = set()
+        while True:
+            new = [p for p in sorted(self.folder.glob("*.npz")) if p.name not in seen and not is_held_out(p)]
+            for path in new:
+                seen.add(path.name)
+                self._ready.extend(self.prepared([path]))
+            if not new:
+                time.sleep(0.5)
 
-def each(paths: Sequence[Path], take: Callable[[Path], None], report: Callable[[str], None] = print) -> None:
-    """Call ``take`` with every path; one that cannot be read is reported and passed over."""
-    for path in paths:
-        try:
-            take(path)
-        except (FormatError, ValueError) as error:
-            report(f"{path} is passed over: {error}")
+    def prepared(self, paths: Sequence[Path]) -> list[Any]:
+        """The samples of paths, prepared; those that cannot be read are left out."""
+        found = []
+        for path in paths:
+            try:
+                found.append(self.prepare(path))
+            except (FormatError, ValueError) as error:
+                self.report(f"{path} is passed over: {error}")
+        return found
 
 
 class ArrivingCamera:
@@ -94,15 +110,10 @@ class ArrivingCamera:
         seed: int = 0,
     ) -> None:
         torch = import_torch()
-        self.arrivals, self.config, self.device, self.batch_size, self.view = (
-            Arrivals(folder),
-            config,
-            device,
-            batch_size,
-            view,
-        )
+        self.config, self.device, self.batch_size, self.view = config, device, batch_size, view
+        self.arrivals = Arrivals(folder, self._prepared)
         self.views, self.look = views or DeviceViews(), look or Appearance()
-        self.store = ImageStore(device, masks=bool(config.prototypes))
+        self.store, self.held_out = (ImageStore(device, masks=bool(config.prototypes)) for _ in range(2))
         self.rng = torch.Generator(device=device).manual_seed(seed)
 
     def network(self) -> Any:
@@ -113,9 +124,13 @@ class ArrivingCamera:
 
     def refresh(self) -> int:
         """Take the images that have come."""
-        each(self.arrivals.take(), lambda path: self.store.add(from_sample(read_image(path), self.store.masks)))
+        for image in self.arrivals.take():
+            self.store.add(image)
         self.store.commit()
         return len(self.store)
+
+    def _prepared(self, path: Path) -> LabelledImage:
+        return from_sample(read_image(path), self.store.masks)
 
     def loss(self, network: Any, step: int) -> dict[str, Any]:
         """Weighted terms of score, box and mask."""
@@ -136,12 +151,12 @@ class ArrivingCamera:
     def check(self, network: Any) -> dict[str, float]:
         """Terms of the loss on held-out images as they are."""
         torch = import_torch()
-        store = ImageStore(self.device, self.store.masks)
-        each(
-            self.arrivals.held_out()[:AT_ONCE],
-            lambda path: store.add(from_sample(read_image(path), store.masks)),
-        )
-        store.commit()
+        store = self.held_out
+        if len(store) < CHECKED:
+            store = self.held_out = ImageStore(self.device, self.store.masks)
+            for image in self.arrivals.prepared(self.arrivals.held_out()[:CHECKED]):
+                store.add(image)
+            store.commit()
         if not len(store):
             return {}
         plain = DeviceViews(scales=(1.0, 1.0), as_it_is=1.0, sought=0.5, mosaic=0.0, pasted=0.0)
@@ -174,9 +189,10 @@ class ArrivingLidar:
         seed: int = 0,
     ) -> None:
         torch = import_torch()
-        self.arrivals, self.config, self.device, self.batch_size = Arrivals(folder), config, device, batch_size
+        self.config, self.device, self.batch_size = config, device, batch_size
+        self.arrivals = Arrivals(folder, self._prepared)
         self.changes, self.box_weight = changes or DeviceAugmentation(), box_weight
-        self.store = ScanStore(config, device)
+        self.store, self.held_out = ScanStore(config, device), ScanStore(config, device)
         self.rng = torch.Generator(device=device).manual_seed(seed)
 
     def network(self) -> Any:
@@ -188,14 +204,15 @@ class ArrivingLidar:
     def refresh(self) -> int:
         """Take the scans that have come."""
         new = self.arrivals.take()
-        each(new, lambda path: self._add(self.store, path))
+        for scan, beams in new:
+            self.store.add(scan, beams)
         if new:
             self.store.commit()
         return len(self.store)
 
-    def _add(self, store: ScanStore, path: Path) -> None:
+    def _prepared(self, path: Path) -> tuple[LabelledScan, Any]:
         scan = labelled_scan(read_scan(path), self.config.class_names)
-        store.add(levelled_scan(scan, self.config), beam_of(scan.points))
+        return levelled_scan(scan, self.config), beam_of(scan.points)
 
     def loss(self, network: Any, step: int) -> dict[str, Any]:
         """Terms of `lcf3d.training.lidar_targets.center_losses`."""
@@ -212,11 +229,14 @@ class ArrivingLidar:
     def check(self, network: Any) -> dict[str, float]:
         """Terms of the loss on held-out scans, turned but otherwise as they are."""
         torch = import_torch()
-        store = ScanStore(self.config, self.device)
-        each(self.arrivals.held_out()[: 2 * self.batch_size], lambda path: self._add(store, path))
-        if not len(store):
-            return {}
-        store.commit()
+        store = self.held_out
+        if len(store) < CHECKED:
+            store = self.held_out = ScanStore(self.config, self.device)
+            for scan, beams in self.arrivals.prepared(self.arrivals.held_out()[:CHECKED]):
+                store.add(scan, beams)
+            if not len(store):
+                return {}
+            store.commit()
         rng = torch.Generator(device=self.device).manual_seed(1)
         paste = (0,) * len(self.config.class_names)
         plain = DeviceAugmentation(3, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, paste)
@@ -251,7 +271,10 @@ class ArrivingLocalizer:
         augmentation: Augmentation | None = None,
         seed: int = 0,
     ) -> None:
-        self.arrivals, self.spec, self.labels, self.cameras, self.views = Arrivals(folder), spec, labels, cameras, views
+        self.spec, self.labels, self.cameras, self.views = spec, labels, cameras, views
+        self.arrivals = Arrivals(folder, lambda path: self.frustums(path, seed))
+        self.held_out: list[PooledFrustum] = []
+        self.checked = 0
         self.shares, self.batch_size, self.augmentation, self.seed = shares, batch_size, augmentation, seed
         self.pool: list[PooledFrustum] = []
         self.scans = 0
@@ -265,8 +288,9 @@ class ArrivingLocalizer:
 
     def refresh(self) -> int:
         """Cut frustums from the scans that have come; gives the number of scans."""
-        new = self.arrivals.take(6)
-        each(new, lambda path: self.pool.extend(self.frustums(path, self.seed)))
+        new = self.arrivals.take()
+        for frustums in new:
+            self.pool += frustums
         self.scans += len(new)
         if new and any(not f.empty for f in self.pool):
             self.task = LocalizerTask(self.spec, self.pool, [], self.batch_size, self.augmentation, self.shares)
@@ -285,11 +309,14 @@ class ArrivingLocalizer:
 
     def check(self, network: Any) -> dict[str, float]:
         """Mean 3D IoU by class on held-out scans."""
-        held_out = [f for path in self.arrivals.held_out()[:20] for f in self.frustums(path, self.seed + 1)]
-        if not any(not f.empty for f in held_out):
+        for path in self.arrivals.held_out()[self.checked : CHECKED // 3]:
+            self.held_out += self.frustums(path, self.seed + 1)
+            self.checked += 1
+        if all(f.empty for f in self.held_out):
             return {}
-        task = LocalizerTask(self.spec, held_out, held_out, self.batch_size)
-        return {name: value for name, value in task.validate(network).items() if name.endswith(" IoU") and "m IoU" not in name}
+        task = LocalizerTask(self.spec, self.held_out, self.held_out, self.batch_size)
+        figures = task.validate(network)
+        return {name: figures[name] for name in (f"{c} IoU" for c in self.spec.class_names) if name in figures}
 
 
 def localizer_of(classes: str, folder: Path, batch_size: int) -> ArrivingLocalizer:

@@ -13,7 +13,7 @@ from typing import Any
 from lcf3d.detectors.camera.onnx_layouts import STRIDES
 from lcf3d.detectors.camera.small_network import PROTOTYPE_STRIDE, SmallOutputs
 from lcf3d.networks.torch import Tensor, functional, torch
-from lcf3d.training.camera_images import ABSENT, IGNORED
+from lcf3d.training.camera_images import IGNORED
 
 # cells that learn an object, and the powers of score and overlap in their choice
 MOST_CELLS, SCORE_POWER, OVERLAP_POWER = 10, 0.5, 4.0

@@ -89,15 +89,12 @@ class ImageStore:
             return
         torch = self.torch
         part = {
-            name: torch.from_numpy(np.stack([row[name] for row in self._new])).to(self.device)
-            for name in self._new[0]
+            name: torch.from_numpy(np.stack([row[name] for row in self._new])).to(self.device) for name in self._new[0]
         }
         self._parts.append(part)
         self.count += len(self._new)
         self._new = []
-        if len(self._parts) > 1:
-            # images stay where they are, the small tables are joined
-            pass
+        # images stay where they are, the small tables are joined
         small = [name for name in part if name not in ("image", "owner")]
         self.table = {name: torch.cat([p[name] for p in self._parts]) for name in small}
         self._starts = np.cumsum([0, *(len(p["labels"]) for p in self._parts)])
@@ -164,9 +161,8 @@ def draw_views(store: ImageStore, count: int, size: tuple[int, int], how: Device
         for name in ("boxes", "visible"):
             part[name] = part[name].clone()
             part[name][..., 0::2] = part[name][..., 0::2].clamp(low[:, None, None], high[:, None, None])
-    both = {
-        name: torch.cat([first[name], second[name]], dim=1) for name in ("boxes", "visible", "labels", "numbers", "full")
-    }
+    tables = ("boxes", "visible", "labels", "numbers", "full")
+    both = {name: torch.cat([first[name], second[name]], dim=1) for name in tables}
     return _finished({**both, "pixels": pixels, "owner": owner}, owner, size, torch)
 
 
@@ -204,9 +200,7 @@ def _window(store: ImageStore, count: int, size: tuple[int, int], how: DeviceVie
     shift = torch.cat([corner, corner], dim=1)[:, None]
     for name in ("boxes", "visible"):
         moved = (rows[name] - shift) * scale[:, None, None]
-        turned = torch.stack(
-            [size[1] - moved[..., 2], moved[..., 1], size[1] - moved[..., 0], moved[..., 3]], dim=-1
-        )
+        turned = torch.stack([size[1] - moved[..., 2], moved[..., 1], size[1] - moved[..., 0], moved[..., 3]], dim=-1)
         result[name] = torch.where((mirrored < 0)[:, None, None], turned, moved)
     whole = (rows["visible"][..., 2:] - rows["visible"][..., :2]).prod(-1).clamp(min=1)
     result["share"] = rows["area"] / whole / 0.5

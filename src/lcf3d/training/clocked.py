@@ -135,6 +135,10 @@ class _ClockRun:
         groups = [{"params": decayed, "weight_decay": settings.weight_decay}, {"params": others, "weight_decay": 0.0}]
         self.optimizer = torch.optim.AdamW(groups, lr=settings.learning_rate)
         self.step = 0
+        self.values = [
+            [value for value in network.state_dict().values() if value.dtype.is_floating_point]
+            for network in (self.averaged, self.network)
+        ]
         self.good = {name: value.clone() for name, value in self.network.state_dict().items()}
         self.history: list[dict[str, Any]] = []
 
@@ -165,7 +169,7 @@ class _ClockRun:
                 bad = 0 if self._note(sums, counted, samples, now - begun) else bad + 1
                 sums, counted, saved = {}, 0, time.time()
                 if bad > MOST_SETBACKS:
-                    raise DetectorError(f"the loss is not finite time after time; {self.path} holds the last good weights")
+                    raise DetectorError(f"the loss is not finite again and again; {self.path} holds good weights")
         if counted:
             self._note(sums, counted, samples, time.time() - begun)
         return self.averaged
@@ -187,13 +191,11 @@ class _ClockRun:
         self.step += 1
         decay = min(self.settings.average, self.step / (10 + self.step))
         with torch.no_grad():
-            pairs = zip(self.averaged.state_dict().values(), self.network.state_dict().values(), strict=True)
-            floats = [(kept, new) for kept, new in pairs if kept.dtype.is_floating_point]
-            torch._foreach_lerp_([kept for kept, _ in floats], [new for _, new in floats], 1 - decay)
+            torch._foreach_lerp_(*self.values, 1 - decay)
         return {name: value.detach() for name, value in terms.items()}
 
     def _note(self, sums: dict[str, Any], counted: int, samples: int, seconds: float) -> bool:
-        """Report, check and write the averaged weights; whether the loss was finite. Else the last good ones are taken."""
+        """Report, check and write the averaged weights; whether the loss was finite. Else go back."""
         terms = {name: float(value) / counted for name, value in sums.items()}
         finite = all(math.isfinite(value) for value in terms.values())
         weights = {name: value.detach().cpu() for name, value in self.averaged.state_dict().items()}

@@ -288,7 +288,7 @@ def _within(points: NDArray[np.float32], box: FloatArray) -> NDArray[np.int64]:
 
 
 def cut_out(points: NDArray[np.float32], box: FloatArray) -> NDArray[np.float32]:
-    """The points inside a box; of more than `MOST_POINTS_OF_OBJECT` an even selection, so that none of it is missing."""
+    """The points inside a box; of more than `MOST_POINTS_OF_OBJECT` an even selection, no side missing."""
     inside = _within(points, box)
     if len(inside) > MOST_POINTS_OF_OBJECT:
         inside = inside[np.linspace(0, len(inside) - 1, MOST_POINTS_OF_OBJECT).astype(np.int64)]

@@ -114,7 +114,8 @@ def levelled_scan(scan: LabelledScan, config: LidarConfig) -> LabelledScan:
     """The scan as a network of this configuration is shown it: on level ground, if it wants that."""
     if config.ground != "level":
         return scan
-    reach = math.hypot(*(max(abs(low), abs(high)) for low, high in zip(config.voxels.area[:2], config.voxels.area[3:5])))
+    x0, y0, _, x1, y1, _ = config.voxels.area
+    reach = math.hypot(max(-x0, x1), max(-y0, y1))
     ground = ground_field(scan.points, (-reach, -reach, reach, reach), LEVEL_M)
     points = level_points(scan.points, ground).astype(np.float32)
     boxes = scan.boxes.copy()

@@ -211,9 +211,7 @@ def _thinned(points: Any, scan: Any, how: DeviceAugmentation, rng: Any, uniform:
     return (1 - drop) * (1 - gone.float().mean(1)), kept
 
 
-def _wrong_ground(
-    points: Any, scan: Any, boxes: Any, how: DeviceAugmentation, rng: Any, torch: Any
-) -> tuple[Any, Any]:
+def _wrong_ground(points: Any, scan: Any, boxes: Any, how: DeviceAugmentation, rng: Any, torch: Any) -> tuple[Any, Any]:
     """Points and boxes on a ground whose height and slopes are a little off, and points that are a little off."""
     count, device = len(boxes), points.device
     heave = how.heave_m * torch.randn(count, generator=rng, device=device)

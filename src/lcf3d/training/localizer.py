@@ -187,7 +187,8 @@ def frustum_losses(outputs: Any, batch: Mapping[str, Any], spec: LocalizerSpec, 
     own_size = size_residual[rows, label]
     own_heading = heading_residual[rows, batch["heading"]]
     size = templates * (1 + own_size)
-    yaw = torch.tensor(spec.headings, dtype=torch.float32, device=device)[batch["heading"]] + own_heading * HEADING_UNIT_RAD
+    headings = torch.tensor(spec.headings, dtype=torch.float32, device=device)
+    yaw = headings[batch["heading"]] + own_heading * HEADING_UNIT_RAD
     corners = corner_distance(outputs.centre, size, yaw, batch["centre"], batch["size"], batch["yaw"])
     entropy = functional.cross_entropy
     terms = {
