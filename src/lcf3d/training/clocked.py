@@ -106,7 +106,7 @@ def train_by_clock(
         run.start(start)
     samples = task.refresh()
     while samples < settings.needed:
-        if time.time() > deadline - 10:
+        if time.time() > deadline - min(10.0, settings.save_every):
             raise DetectorError(f"only {samples} of {settings.needed} samples came before the deadline")
         time.sleep(0.5)
         samples = task.refresh()
