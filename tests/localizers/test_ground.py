@@ -3,16 +3,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lcf3d.localizers.ground import (
-    CELL,
-    REACH,
-    STATIONS,
-    fit_plane,
-    ground_along,
-    lowest_returns,
-    ordered,
-    station_of,
-)
+from lcf3d.geometry.ground import CELL, REACH, fit_plane, lowest_returns, ordered
+from lcf3d.localizers.ground import STATIONS, ground_along, station_of
 from tests.localizers.scenes import SENSOR_HEIGHT, scan, standing
 
 

@@ -36,6 +36,26 @@ def test_every_mesh_stays_in_its_box_and_nearly_fills_it(kind, dataset):
     assert kind in KITTI_CLASS
 
 
+@pytest.mark.parametrize("kind", ["pedestrian", "cyclist"])
+def test_varied_people_stay_in_their_boxes_and_differ(kind):
+    rng = np.random.default_rng(8)
+    path = Path((0.0, 0.0), 0.0, 0.0, 50.0)
+    sizes, colours = set(), set()
+    for k in range(25):
+        actor = make_actor(1, kind, Motion(path, 10.0, 0.0, 1.4 * (k % 2)), rng, varied=True)
+        length, width, height = actor.size
+        for time in (0.0, 0.4):
+            mesh = actor.mesh_at(time)
+            low, high = mesh.bounds()
+            assert (low >= np.array([-length / 2, -width / 2, 0]) - 1e-4).all()
+            assert (high <= np.array([length / 2, width / 2, height]) + 1e-4).all()
+            assert high[2] - low[2] > 0.93 * height
+        sizes.add(len(mesh))
+        colours.add(tuple(mesh.colour.mean(axis=0).round(3).tolist()))
+    assert len(sizes) > 4
+    assert len(colours) > 15
+
+
 @settings(max_examples=30, deadline=None)
 @given(heading=st.floats(-3, 3), bend=st.floats(-0.01, 0.01), s=st.floats(0, 90))
 def test_paths_have_unit_speed_and_left_is_left(heading, bend, s):
@@ -142,7 +162,18 @@ def test_rain_loses_far_returns_and_night_darkens_images():
 
 def test_sparse_has_a_quarter_of_the_beams():
     assert len(get_preset("sparse16").lidar.elevations_deg) == 16
-    assert set(all_presets()) == {"kitti64", "mono64", "nuscenes32", "sparse16", "rain", "night"}
+    assert set(all_presets()) == {
+        "kitti64",
+        "mono64",
+        "nuscenes32",
+        "nuscenes_sweeps",
+        "sparse16",
+        "rain",
+        "night",
+        "train_kitti",
+        "train_mono",
+        "train_nuscenes",
+    }
 
 
 def test_equal_seeds_give_equal_scenes_and_frames():

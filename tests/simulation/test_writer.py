@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from PIL import Image
+from scipy.spatial import cKDTree
 
 from lcf3d.datasets.kitti import KittiDataset
 from lcf3d.datasets.kitti_check import check_kitti
@@ -13,11 +14,14 @@ from lcf3d.datasets.nuscenes_check import check_nuscenes
 from lcf3d.errors import ConfigError, DatasetError, MissingExtraError
 from lcf3d.formats.kitti import read_objects
 from lcf3d.geometry.boxes import points_in_boxes
+from lcf3d.geometry.camera import project_points
 from lcf3d.simulation import kitti_layout, writer
+from lcf3d.simulation import presets as presets_module
 from lcf3d.simulation.frames import simulate_drive
+from lcf3d.simulation.presets import get_preset
 from lcf3d.simulation.writer import Recipe, write_dataset
 
-from .conftest import shrink_presets
+from .conftest import shrink_presets, tiny
 
 
 def contents(root):
@@ -59,7 +63,9 @@ def test_instance_ids_and_tracks_belong_to_the_label_lines(kitti):
         assert len(tracks) == len(objects)
         for track, box in zip(tracks, objects.boxes2d, strict=True):
             rows, columns = np.nonzero(ids == track)
-            assert box.tolist() == [columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]
+            bounds = np.array([columns.min(), rows.min(), columns.max() + 1, rows.max() + 1])
+            assert (box[:2] <= bounds[:2] + 1.01).all()  # the box bounds the whole object, the mask what is seen of it
+            assert (box[2:] >= bounds[2:] - 1.01).all()
 
 
 def test_the_splits_share_no_frame(kitti):
@@ -217,3 +223,44 @@ def test_a_data_set_of_one_camera_is_complete_without_the_other(tmp_path):
     counts: list[int] = []
     write_dataset(recipe, tmp_path, resume=True, progress=counts.append)
     assert counts == [1], "nothing is left to do"
+
+
+def test_sweeps_and_cameras_with_their_own_times_are_read_back(tmp_path, tiny_presets, monkeypatch):
+    preset = replace(get_preset("nuscenes_sweeps"), sweeps=2)
+    monkeypatch.setattr(presets_module, "all_presets", lambda: {preset.name: preset})
+    write_dataset(Recipe(preset.name, 2, seed=2, sequence=True, street="city"), tmp_path)
+    assert check_nuscenes(tmp_path) == []
+    assert len(list((tmp_path / "sweeps" / "LIDAR_TOP").iterdir())) == 2
+    rows = json.loads((tmp_path / "v1.0-simulated" / "sample_data.json").read_text())
+    lidar = [row for row in rows if row["fileformat"] == "pcd"]
+    assert [row["is_key_frame"] for row in lidar] == [True, False, False, True]
+    assert np.diff([row["timestamp"] for row in lidar]).tolist() == [400_000, 50_000, 50_000]
+    assert [row["next"] for row in lidar] == [*(row["token"] for row in lidar[1:]), ""]
+    last = list(simulate_drive(preset, 2, 2, street="city"))[1]
+    frame = NuscenesDataset(tmp_path, sweeps=2)[1]
+    ages = np.unique(frame.points[:, 4].round(3))
+    np.testing.assert_allclose(ages, [0, 0.05, 0.1], atol=1e-3)
+    # what stands still is where the key frame has it, although the car has moved by up to two metres
+    still = last.scan.points[(last.scan.owner == 0) & (np.abs(last.scan.points[:, 2] + 1.84) > 1.0), :3]
+    old = frame.points[np.abs(frame.points[:, 4] - 0.1) < 0.01, :3]
+    near = cKDTree(still).query(old[np.abs(old[:, 2] + 1.84) > 1.0])[0]
+    assert np.median(near) < 0.35
+    expected = {camera.name: camera for camera in last.cameras}
+    assert any(preset.camera_delays_s)
+    for camera in frame.cameras:
+        wanted = expected[camera.name].pixels_from_lidar
+        np.testing.assert_allclose(camera.pixels_from_lidar, wanted, rtol=1e-5, atol=0.05)
+
+
+def test_a_camera_that_fires_late_sees_still_things_where_its_own_pose_says():
+    preset = replace(tiny("nuscenes32"), camera_delays_s=(0.0, 0.0, 0.0, 0.2, 0.0, 0.0))
+    late = list(simulate_drive(preset, 2, 2, street="residential"))[1]
+    assert late.scene.ego.speed > 1
+    camera = late.cameras[3]
+    moved = camera.camera_from_lidar @ np.linalg.inv(preset.cameras[3].camera_from_lidar)
+    assert np.linalg.norm(moved[:3, 3]) == pytest.approx(0.2 * late.scene.ego.speed, rel=0.05)
+    pixels, depth = project_points(late.scan.points[late.scan.owner == 0], camera)
+    u, v = np.floor(np.nan_to_num(pixels, nan=-1)).astype(int).T
+    inside = (depth > 2) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+    seen = late.renders[camera.name].depth[v[inside], u[inside]]
+    assert (np.abs(seen - depth[inside]) < 0.05 * depth[inside]).mean() > 0.7

@@ -34,7 +34,7 @@ def settings(**changes: float) -> TrainingSettings:
 
 def test_a_batch_depends_on_its_generator_alone() -> None:
     first, second = (task().batch(7, np.random.default_rng(5)) for _ in range(2))
-    assert set(first) == {"pixels", "image", "boxes", "visible", "labels", "numbers", "owner"}
+    assert set(first) == {"pixels", "boxes", "visible", "labels", "numbers", "owner"}
     assert first["pixels"].shape == (2, 3, 32, 64)
     for name, value in first.items():
         torch.testing.assert_close(value, second[name], rtol=0, atol=0)

@@ -3,6 +3,7 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from lcf3d.detectors.camera.small_network import SmallOutputs  # noqa: E402
+from lcf3d.training.camera_images import ABSENT  # noqa: E402
 from lcf3d.training.camera_losses import (  # noqa: E402
     FLOOR,
     MOST_CELLS,
@@ -37,19 +38,20 @@ def targets(boxes: list[list[float]], labels: list[int], masks: bool = True) -> 
     for number, (x1, y1, x2, y2) in enumerate(corners.int().tolist(), 1):
         owner[0, y1:y2, x1:x2] = number
     count = len(corners)
+    # one row more than there are objects
+    corners = torch.cat([corners, torch.zeros(1, 4)])[None]
     return Targets(
-        torch.zeros(count, dtype=torch.int64),
         corners,
         corners,
-        torch.tensor(labels, dtype=torch.int64),
+        torch.tensor([[*labels, ABSENT]], dtype=torch.int64),
         owner if masks else None,
-        torch.arange(1, count + 1, dtype=torch.uint8),
+        torch.arange(1, count + 2, dtype=torch.uint8)[None],
     )
 
 
 def chosen(boxes: list[list[float]], labels: list[int]):
     wanted = targets(boxes, labels)
-    return assign(outputs(), wanted, 0, torch.arange(len(labels)), cell_centres(SIZE, torch.zeros(1)))
+    return assign(outputs(), wanted, cell_centres(SIZE, torch.zeros(1)))
 
 
 def test_centres_follow_the_grids() -> None:
@@ -60,8 +62,8 @@ def test_centres_follow_the_grids() -> None:
 
 def test_cells_that_see_an_object_best_learn_it() -> None:
     result = chosen([[16, 8, 32, 24]], [1])
-    assert 0 < len(result.cells) <= MOST_CELLS
-    assert (result.objects == 0).all()
+    assert 0 < int(result.owned.sum()) <= MOST_CELLS
+    assert (result.objects[result.owned] == 0).all()
     # four fine cells touch the middle; each overlaps with 12 x 12 of 16 x 16 pixels, and no cell does better
     best = 144 / (2 * 256 - 144)
     assert result.quality.max().item() == pytest.approx(FLOOR + (1 - FLOOR) * best, abs=1e-5)
@@ -69,18 +71,17 @@ def test_cells_that_see_an_object_best_learn_it() -> None:
 
 
 def test_an_object_smaller_than_a_cell_is_learned() -> None:
-    assert len(chosen([[17, 9, 19, 12]], [2]).cells) > 0
+    assert chosen([[17, 9, 19, 12]], [2]).owned.any()
 
 
 def test_a_cell_learns_one_object_only() -> None:
     result = chosen([[16, 8, 32, 24], [18, 8, 34, 24]], [0, 0])
-    assert len(result.cells.unique()) == len(result.cells)
-    assert set(result.objects.tolist()) == {0, 1}
+    assert set(result.objects[result.owned].tolist()) == {0, 1}
 
 
 def test_scores_on_ignored_objects_are_not_taught() -> None:
     result = chosen([[0, 0, 64, 32]], [-1])
-    assert len(result.cells) == 0
+    assert not result.owned.any()
     assert result.ignored.all()
     answers = outputs()
     losses(answers, targets([[0, 0, 64, 32]], [-1]), SIZE)["score"].backward()
@@ -94,6 +95,19 @@ def test_an_image_without_objects_teaches_low_scores_only() -> None:
     assert terms["mask"].item() == 0
     sum(terms.values()).backward()
     assert (answers.logits.grad > 0).all()
+
+
+def test_images_of_a_batch_do_not_see_each_other() -> None:
+    one, two = targets([[16, 8, 32, 24]], [0]), targets([[40, 4, 50, 28]], [1])
+    tables = ("boxes", "visible", "labels", "owner", "numbers")
+    both = Targets(*(torch.cat([getattr(one, name), getattr(two, name)]) for name in tables))
+    single = outputs()
+    maps = ("logits", "boxes", "coefficients", "prototypes")
+    pair = SmallOutputs(*(torch.cat([getattr(single, name)] * 2) for name in maps))
+    centres = cell_centres(SIZE, torch.zeros(1))
+    together = assign(pair, both, centres)
+    for row, alone in enumerate((one, two)):
+        torch.testing.assert_close(together.quality[row], assign(single, alone, centres).quality[0])
 
 
 def test_without_masks_there_is_no_mask_term() -> None:

@@ -11,7 +11,11 @@ import typer
 def simulate(
     out: Annotated[Path, typer.Argument(help="Folder to write the data set to; must be empty or new unless --resume.")],
     preset: Annotated[
-        str, typer.Option(help="kitti64, mono64, sparse16, rain, night (KITTI layout) or nuscenes32 (nuScenes layout).")
+        str,
+        typer.Option(
+            help="kitti64, mono64, sparse16, rain, night, train_kitti, train_mono (KITTI layout), nuscenes32 or "
+            "train_nuscenes (nuScenes layout)."
+        ),
     ] = "kitti64",
     frames: Annotated[int, typer.Option(help="Number of frames.")] = 20,
     seed: Annotated[int, typer.Option(help="Equal seeds give equal bytes.")] = 0,

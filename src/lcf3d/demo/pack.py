@@ -81,7 +81,7 @@ def ship(frame: SimulatedFrame, distractors: FloatArray, kinds: Sequence[str], n
         frame.boxes[seen],
         kitti.class_names,
         np.array([frame.actors[k].id for k in seen], dtype=np.int64),
-        kitti.boxes2d,
+        frame.sightings["left"].boxes2d[seen],
         kitti.occluded,
         kitti.truncated,
     )

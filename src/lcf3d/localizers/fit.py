@@ -10,7 +10,7 @@ import math
 import numpy as np
 from numba import njit
 
-from lcf3d.localizers.ground import ordered
+from lcf3d.geometry.ground import ordered
 
 PARAMETERS = 7
 X, Y, LIFT, LENGTH, WIDTH, HEIGHT, YAW = range(PARAMETERS)

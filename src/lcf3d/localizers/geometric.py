@@ -13,6 +13,7 @@ from numba import njit
 
 from lcf3d.fusion.frustum import FrustumProposals
 from lcf3d.geometry.boxes import wrap_angle
+from lcf3d.geometry.ground import fit_plane, lowest_returns
 from lcf3d.localizers.cluster import BIN, BINS, GAP_PER_METRE, MOST_POINTS, range_profile, take_cluster, weigh_points
 from lcf3d.localizers.fit import (
     BOX2D,
@@ -40,7 +41,7 @@ from lcf3d.localizers.fit import (
     search,
     solid_cost,
 )
-from lcf3d.localizers.ground import RADIUS, STATIONS, fit_plane, ground_along, lowest_returns, station_of
+from lcf3d.localizers.ground import RADIUS, STATIONS, ground_along, station_of
 from lcf3d.localizers.shapes import SHAPES, ObjectShape
 from lcf3d.structures import FloatArray
 

@@ -8,13 +8,15 @@ from functools import lru_cache
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
-from lcf3d.simulation.meshes import people, two_wheelers, vehicles
+from lcf3d.simulation.meshes import outfits, people, two_wheelers, vehicles
 from lcf3d.simulation.meshes.car_shapes import SHAPES
 from lcf3d.simulation.meshes.cars import build_car
-from lcf3d.simulation.meshes.primitives import Mesh
+from lcf3d.simulation.meshes.primitives import Mesh, rotation_z
 from lcf3d.simulation.roads import Path
 from lcf3d.simulation.sizes import draw_size
+from lcf3d.simulation.worlds import level_from_tilted
 
 Colour = tuple[float, float, float]
 
@@ -143,16 +145,26 @@ class Actor:
     mesh_at: Callable[[float], Mesh]
     stopped: bool = False
 
-    def box(self, time: float, ground: float) -> tuple[float, float, float, float, float, float, float]:
-        """World box (x, y, z of the geometric centre, length, width, height, yaw), standing at height ``ground``."""
+    def box(
+        self, time: float, ground: float, up: NDArray[np.float64] | None = None
+    ) -> tuple[float, float, float, float, float, float, float]:
+        """World box (x, y, z of the geometric centre, length, width, height, yaw), standing at height ``ground``.
+
+        ``up`` (3,) is where the object's own vertical points, None for straight up; the box is upright all the same.
+        """
         x, y, yaw = self.motion.pose(time)
         length, width, height = self.size
-        return x, y, ground + height / 2, length, width, height, yaw
+        if up is None:
+            return x, y, ground + height / 2, length, width, height, yaw
+        centre = np.array([x, y, ground]) + up * height / 2
+        return float(centre[0]), float(centre[1]), float(centre[2]), length, width, height, yaw
 
-    def mesh(self, time: float, ground: float) -> Mesh:
-        """Mesh in the world, standing at height ``ground``."""
+    def mesh(self, time: float, ground: float, up: NDArray[np.float64] | None = None) -> Mesh:
+        """Mesh in the world, standing at height ``ground``, its vertical along ``up`` (3,) or straight up."""
         x, y, yaw = self.motion.pose(time)
-        return self.mesh_at(time).placed(x, y, ground, yaw)
+        if up is None:
+            return self.mesh_at(time).placed(x, y, ground, yaw)
+        return self.mesh_at(time).turned(level_from_tilted(up).T @ rotation_z(yaw)).moved((x, y, ground))
 
 
 def _colour(rng: np.random.Generator) -> Colour:
@@ -247,6 +259,36 @@ def _person_mesh(
     return mesh_at
 
 
+def _varied_person_mesh(
+    kind: str, size: tuple[float, float, float], speed: float, rng: np.random.Generator
+) -> Callable[[float], Mesh]:
+    """As `_person_mesh`, of somebody who is like nobody else; slower, because nothing is kept for others."""
+    outfit, frame, phase = outfits.random_outfit(rng), _colour(rng), float(rng.uniform(0, 2 * np.pi))
+    stride = float(rng.uniform(0.26, 0.62)) if speed else float(rng.choice([0.0, 0.08, 0.16]))
+    rate = 2 * np.pi * (0.9 if kind == "pedestrian" else 1.1) * float(rng.uniform(0.85, 1.15)) * (1 if speed else 0)
+
+    def built(angle: float) -> Mesh:
+        if kind == "pedestrian":
+            return outfits.varied_pedestrian(outfit, angle, stride)
+        return outfits.varied_cyclist(outfit, frame, angle)
+
+    low, high = built(np.pi / 2 if kind == "pedestrian" else 0.0).bounds()  # the widest moment of a step
+    factor = np.array(size) / (high - low)
+    if kind == "pedestrian":
+        factor[:2] = np.minimum(factor[:2], factor[2] * 1.2)
+    centre = (low + high) / 2
+    limit = np.array([size[0] / 2, size[1] / 2, size[2]], dtype=np.float32)
+
+    def mesh_at(time: float) -> Mesh:
+        mesh = built(phase + rate * time)
+        mesh = mesh.moved((-centre[0], -centre[1], -low[2])).scaled(
+            factor * [1, 1, (high - low)[2] / mesh.bounds()[1][2]]
+        )
+        return replace(mesh, corners=np.clip(mesh.corners, -limit * [1, 1, 0], limit).astype(np.float32))
+
+    return mesh_at
+
+
 def make_actor(
     id: int,
     kind: str,
@@ -256,16 +298,18 @@ def make_actor(
     size: tuple[float, float, float] | None = None,
     stopped: bool = False,
     fine: bool = True,
+    varied: bool = False,
 ) -> Actor:
     """A road user of a kind, with size, shape and colours drawn at random.
 
     ``dataset`` (``kitti`` or ``nuscenes``) names the statistics its size is drawn from; ``fine`` False makes
-    cars coarser, for those that stay far away.
+    cars coarser, for those that stay far away; ``varied`` gives every person clothes, arms and a gait of their own.
     """
     if size is None:
         size = actor_size(kind, dataset, rng)
     if kind in ("pedestrian", "cyclist"):
-        return Actor(id, kind, size, motion, _person_mesh(kind, size, motion.speed, rng), stopped)
+        person = _varied_person_mesh if varied else _person_mesh
+        return Actor(id, kind, size, motion, person(kind, size, motion.speed, rng), stopped)
     mesh = _still_mesh(kind, size, fine, rng)
     return Actor(id, kind, size, motion, lambda _time: mesh, stopped)
 

@@ -42,14 +42,19 @@ def benchmark(frames: int = 5, preset: str | Preset = "kitti64") -> dict[str, fl
 
     for index in range(frames + 1):  # the first compiles and fills the caches
         rng = np.random.default_rng(index)
-        scene = timed("scene", lambda: build_scene(np.random.default_rng(index), sensors.layout))  # noqa: B023
+        scene = timed("scene", lambda: build_scene(np.random.default_rng(index), sensors.layout, world=sensors.world))  # noqa: B023
         stage = timed("stage", lambda: make_stage(scene, sensors, 0.0))  # noqa: B023
         timed("lidar", lambda: scan(sensors.lidar, stage, (0.0, 0.0), sensors.rain, rng))  # noqa: B023
         exposure = measure_exposure(sensors.cameras[0], stage)
         timed("camera", lambda: render(sensors.cameras[0], stage, rng, exposure))  # noqa: B023
         start = perf_counter()
         whole = capture(
-            build_scene(np.random.default_rng(index), sensors.layout), sensors, 0.0, (index,), "bench", threads=2
+            build_scene(np.random.default_rng(index), sensors.layout, world=sensors.world),
+            sensors,
+            0.0,
+            (index,),
+            "bench",
+            threads=2,
         )
         _ = whole.kitti if sensors.layout == "kitti" else whole.labels
         times["frame"].append(perf_counter() - start)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from lcf3d.simulation.light import Light
 from lcf3d.simulation.materials import camera_table
 from lcf3d.simulation.meshes.primitives import Mesh
+from lcf3d.simulation.photo import NEUTRAL, Photo
 from lcf3d.simulation.rays import Hits, RayTracer
 from lcf3d.simulation.shading import locate, shade
 from lcf3d.simulation.textures import texture_ids, texture_pyramids
@@ -99,7 +100,7 @@ def _forward(camera: Camera, stage: Stage) -> NDArray[np.float64]:
     return forward
 
 
-def render(camera: Camera, stage: Stage, rng: np.random.Generator, exposure: float) -> Render:
+def render(camera: Camera, stage: Stage, rng: np.random.Generator, exposure: float, photo: Photo = NEUTRAL) -> Render:
     """Image, owners and depth of one camera."""
     width, height = camera.width, camera.height
     grid_u, grid_v = np.meshgrid(np.arange(width, dtype=np.float32) + 0.5, np.arange(height, dtype=np.float32) + 0.5)
@@ -124,7 +125,7 @@ def render(camera: Camera, stage: Stage, rng: np.random.Generator, exposure: flo
     )
     if len(edge):
         radiance[edge] = _smooth(stage, camera, u, v, edge, opened, forward, radiance[edge])
-    image = develop(radiance.reshape(height, width, 3), rng, exposure, stage.light.night > 0)
+    image = develop(radiance.reshape(height, width, 3), rng, exposure, stage.light.night > 0, photo)
     return Render(image, owner.reshape(height, width), depth.reshape(height, width))
 
 
@@ -330,9 +331,13 @@ def find_edges(triangle, material, owner, normal, depth):  # type: ignore[no-unt
     return edge
 
 
-def develop(radiance: Floats, rng: np.random.Generator, exposure: float, night: bool) -> NDArray[np.uint8]:
-    """(H, W, 3) uint8 from linear radiance: exposure, film curve, sensor noise, sRGB."""
-    x = radiance * np.float32(exposure)
+def develop(
+    radiance: Floats, rng: np.random.Generator, exposure: float, night: bool, photo: Photo = NEUTRAL
+) -> NDArray[np.uint8]:
+    """(H, W, 3) uint8 from linear radiance: exposure, the look of ``photo``, film curve, sensor noise, sRGB."""
+    x = radiance * np.float32(exposure * photo.exposure)
+    if photo != NEUTRAL:
+        x = photo.apply(x)
     grey = x.mean(axis=2, keepdims=True)
     x = np.maximum(grey + (x - grey) * np.float32(1.12), 0)
     noise = rng.standard_normal(x.shape, dtype=np.float32)
@@ -340,7 +345,7 @@ def develop(radiance: Floats, rng: np.random.Generator, exposure: float, night: 
         x
         + noise
         * (np.float32(0.004) + np.float32(0.012) * np.sqrt(np.maximum(x, 0)))
-        * np.float32(2.0 if night else 1.0),
+        * np.float32(photo.noise * (2.0 if night else 1.0)),
         0,
     )
     return film(x)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -19,9 +19,11 @@ from lcf3d.simulation.camera import Render, Stage, measure_exposure, render
 from lcf3d.simulation.labels import MAX_HIDDEN, Sightings, kitti_objects, sight
 from lcf3d.simulation.lidar import Scan, scan
 from lcf3d.simulation.light import make_light
-from lcf3d.simulation.presets import Preset, get_preset
+from lcf3d.simulation.photo import NEUTRAL, Photo, draw_photo
+from lcf3d.simulation.presets import KITTI_SIZE, Preset, get_preset
 from lcf3d.simulation.rays import RayTracer
 from lcf3d.simulation.scene import Scene, build_scene
+from lcf3d.simulation.worlds import level_from_tilted
 from lcf3d.structures import (
     KITTI_CLASSES,
     NUSCENES_CLASSES,
@@ -44,7 +46,8 @@ class SimulatedFrame:
         preset: sensors and weather.
         scene: the street and everybody on it.
         time: seconds into the drive.
-        world_from_lidar: (4, 4) pose of the LiDAR; upright, so that boxes upright in the world are upright for it.
+        world_from_lidar: (4, 4) pose of the LiDAR; upright, so that boxes upright in the world are upright for it,
+            unless the preset's world has a mounting.
         scan: LiDAR returns with the actors they came from.
         renders: image, owner and depth by camera name; empty when images were not asked for.
         boxes: (A, 7) boxes of all actors in the LiDAR frame.
@@ -100,6 +103,19 @@ class SimulatedFrame:
         )
 
     @property
+    def cameras(self) -> tuple[Camera, ...]:
+        """The preset's cameras; those that fire at a time of their own are where the car has carried them by then."""
+        moved = []
+        for number, camera in enumerate(self.preset.cameras):
+            delay = self.preset.delay(number)
+            if delay:
+                later = sensor_pose(self.scene, self.preset, self.time + delay)
+                later_from_now = invert_rigid(later[None])[0] @ self.world_from_lidar
+                camera = replace(camera, camera_from_lidar=camera.camera_from_lidar @ later_from_now)
+            moved.append(camera)
+        return tuple(moved)
+
+    @property
     def frame(self) -> Frame:
         """The frame as detectors and the fusion take it."""
         images = {name: r.image for name, r in self.renders.items()}
@@ -107,7 +123,7 @@ class SimulatedFrame:
         if self.preset.layout == "nuscenes":
             points = points * np.array([1, 1, 1, 255], dtype=np.float32)
         labels = self.labels if self.renders or self.preset.layout == "nuscenes" else None
-        return Frame(self.id, points, self.preset.cameras, images, labels)
+        return Frame(self.id, points, self.cameras, images, labels)
 
     def detections_2d(self, camera: str) -> Detections2D:
         """What a perfect camera detector finds in an image: the labelled objects with visible boxes and masks.
@@ -178,7 +194,7 @@ def capture(
     with ThreadPoolExecutor(max(1, threads)) as pool:
         turning = pool.submit(scan, preset.lidar, stage, scene.ego.velocity(time), preset.rain, sensor)
         if images:
-            seen = _look(scene, preset, stage, boxes, seed, range(len(preset.cameras)), pool.map)
+            seen = _look(scene, preset, time, stage, seed, range(len(preset.cameras)), pool.map)
         turn = turning.result()
     points_on = np.zeros(len(boxes), dtype=np.int64)
     near = np.flatnonzero(np.hypot(boxes[:, 0], boxes[:, 1]) < preset.lidar.max_range_m + 12.0)
@@ -207,30 +223,34 @@ def look(
         MissingExtraError: embreex is not installed.
     """
     stage = make_stage(scene, preset, time)
-    boxes = transform_boxes(scene.boxes(time), invert_rigid(stage.world_from_lidar[None])[0])
     wanted = [number for number, camera in enumerate(preset.cameras) if camera in cameras]
-    return _look(scene, preset, stage, boxes, seed, wanted, map)
+    return _look(scene, preset, time, stage, seed, wanted, map)
 
 
 def _look(
     scene: Scene,
     preset: Preset,
+    time: float,
     stage: Stage,
-    boxes: FloatArray,
     seed: tuple[int, ...],
     numbers: Sequence[int],
     map_: Callable[..., Iterable[tuple[Render, Sightings]]],
 ) -> dict[str, tuple[Render, Sightings]]:
-    """Image and sightings of the cameras of those numbers, by name."""
-    corners = [stage.mesh.corners[stage.owner == actor.id] for actor in scene.actors]
+    """Image and sightings of the cameras of those numbers, by name; ``stage`` is that of ``time``."""
     shared = measure_exposure(preset.cameras[0], stage)
+    photo = _photo(scene, preset)
 
     def one(number: int) -> tuple[Render, Sightings]:
-        camera: Camera = preset.cameras[number]
+        camera, delay = preset.cameras[number], preset.delay(number)
+        now = make_stage(scene, preset, time + delay) if delay else stage
+        boxes = transform_boxes(scene.boxes(time + delay), invert_rigid(now.world_from_lidar[None])[0])
         rng = np.random.default_rng([*seed, 2, number])
-        exposure = shared if preset.layout == "kitti" else measure_exposure(camera, stage)
-        picture = render(camera, stage, rng, exposure)
-        return picture, sight(camera, picture.owner, scene.actors, corners, boxes, stage.world_from_lidar)
+        exposure = shared if preset.layout == "kitti" else measure_exposure(camera, now)
+        picture = render(camera, now, rng, exposure, photo)
+        ids = [actor.id for actor in scene.actors]  # the triangles of an actor follow one another
+        first, last = (np.searchsorted(now.owner, ids, side=side) for side in ("left", "right"))
+        corners = [now.mesh.corners[a:b] for a, b in zip(first, last, strict=True)]
+        return picture, sight(camera, picture.owner, scene.actors, corners, boxes, now.world_from_lidar)
 
     return dict(zip((preset.cameras[number].name for number in numbers), map_(one, numbers), strict=True))
 
@@ -238,14 +258,48 @@ def _look(
 def make_stage(scene: Scene, preset: Preset, time: float) -> Stage:
     """Triangles, light and pose of a scene at a moment, ready for rays."""
     snapshot = scene.at(time)
-    x, y, yaw = scene.ego.pose(time)
-    pose = np.eye(4)
-    pose[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
-    pose[:3, 3] = x, y, float(scene.site.terrain.height(x, y)) + preset.lidar.height_m
+    pose = sensor_pose(scene, preset, time)
+    x = float(pose[0, 3])
     light = make_light(
         scene.sun, scene.cloudiness, scene.haze_m, scene.look, preset.rain, preset.night, lamp_positions(scene, x)
     )
+    shade = _photo(scene, preset).shade
+    if shade != 1:
+        light = replace(light, sky_ambient=light.sky_ambient * shade, ground_ambient=light.ground_ambient * shade)
     return Stage(RayTracer(snapshot.mesh.corners), snapshot.mesh, snapshot.owner, light, scene.site.markings(), pose)
+
+
+def _photo(scene: Scene, preset: Preset) -> Photo:
+    """The look of a drive's images."""
+    if not preset.world.varied_photos:
+        return NEUTRAL
+    scale = preset.cameras[0].width / KITTI_SIZE[0] if preset.layout == "kitti" else 1.0
+    return draw_photo(np.random.default_rng([scene.look, 9]), scale)
+
+
+def sensor_pose(scene: Scene, preset: Preset, time: float) -> FloatArray:
+    """(4, 4) world from LiDAR: level at its height above the ground, or riding as the preset's mounting says.
+
+    A car on uneven ground tilts with it; what its springs and load add is drawn anew every half second.
+    """
+    x, y, yaw = scene.ego.pose(time)
+    terrain, mounting = scene.site.terrain, preset.world.mounting
+    pose = np.eye(4)
+    pose[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
+    pose[:3, 3] = x, y, float(terrain.height(x, y)) + preset.lidar.height_m
+    if mounting is None:
+        return pose
+    before = np.floor(2 * time)
+    rides = [mounting.draw(np.random.default_rng([scene.look, int(before) + k])) for k in (0, 1)]
+    share = 2 * time - before
+    height = sum(w * ride[0] for w, ride in zip((1 - share, share), rides, strict=True))
+    up = sum(w * ride[1][2] for w, ride in zip((1 - share, share), rides, strict=True))
+    # the slope that the mounting adds, on top of the ground's own: both are small enough for their order not to matter
+    slant = level_from_tilted(terrain.normal(x, y)).T
+    pose[:3, :3] = slant @ pose[:3, :3] @ level_from_tilted(up / np.linalg.norm(up))
+    crown = scene.site.world.crown * max(scene.site.street.half_width - abs(scene.ego.offset), 0.0)
+    pose[:3, 3] += slant[:, 2] * (preset.lidar.height_m + height) - [0, 0, preset.lidar.height_m - crown]
+    return pose
 
 
 def lamp_positions(scene: Scene, around: float) -> NDArray[np.float64]:
@@ -319,7 +373,7 @@ def simulate_drive(
         raise ConfigError(f"seed and number must not be negative, got {seed} and {drive}")
     sensors = get_preset(preset) if isinstance(preset, str) else preset
     duration = (frames - 1) / sensors.rate_hz
-    scene = build_scene(np.random.default_rng([seed, drive]), sensors.layout, duration, street, density)
+    scene = build_scene(np.random.default_rng([seed, drive]), sensors.layout, duration, street, density, sensors.world)
     for number in range(first, frames):
         name = f"{drive:06d}" if frames == 1 else f"{drive:04d}_{number:06d}"
         yield capture(scene, sensors, number / sensors.rate_hz, (seed, drive, number), name, images, threads)

@@ -85,11 +85,15 @@ def calibration_text(preset: Preset) -> str:
 
 
 def write_splits(root: Path, ids: Sequence[str], frames_per_drive: int) -> None:
-    """Write ``ImageSets/train.txt`` and ``val.txt``; no drive is divided unless it is the only one."""
+    """Write ``ImageSets/train.txt`` and ``val.txt``; no drive is divided unless it is the only one.
+
+    Where there are fewer than `VAL_EVERY` drives, the last of several is ``val``.
+    """
     groups = [ids[k : k + frames_per_drive] for k in range(0, len(ids), frames_per_drive)]
     if len(groups) == 1:
         groups = [[id] for id in ids]
-    val = [id for k, group in enumerate(groups) if k % VAL_EVERY == VAL_EVERY - 1 for id in group]
+    every = min(VAL_EVERY, max(2, len(groups)))
+    val = [id for k, group in enumerate(groups) if k % every == every - 1 for id in group]
     chosen = set(val)
     train = [id for id in ids if id not in chosen]
     for name, members in (("train", train), ("val", val)):

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from lcf3d.formats.kitti import KittiObjects
 from lcf3d.geometry.boxes import box_corners, kitti_from_lidar, observation_angle, wrap_angle
-from lcf3d.geometry.camera import NEAR, project_boxes
+from lcf3d.geometry.camera import NEAR, project_boxes, project_points
 from lcf3d.simulation.actors import KITTI_CLASS, Actor
 from lcf3d.simulation.camera import camera_rays
 from lcf3d.simulation.presets import KITTI_FOCAL
@@ -31,6 +31,8 @@ MAX_HIDDEN: Final = 0.97
 """Objects of which less than this share is hidden are labelled; others become DontCare."""
 MAX_DISTANCE_M: Final = 80.0
 """Objects farther away become DontCare."""
+NARROW: Final = ("pedestrian",)
+"""Kinds whose 2D box KITTI draws narrower than the projected 3D box (0.68 of its width in the median)."""
 _RAYS = 1200
 
 
@@ -40,7 +42,8 @@ class Sightings:
 
     Attributes:
         boxes2d: (A, 4) x1, y1, x2, y2 that bound the visible pixels (pixel edges), zeros where none is visible.
-        amodal: (A, 4) bounds of the projected 3D box clipped to the image, zeros where it is outside.
+        amodal: (A, 4) bounds of the whole object clipped to the image as KITTI draws them, zeros where it is outside:
+            those of the projected 3D box, but for people on foot only as wide as their outline.
         pixels: (A,) visible pixels.
         hidden: (A,) share of the part inside the image that something else covers; 1 where nothing is visible.
         truncated: (A,) share of the object outside the image, or behind the camera; 1 where nothing is visible.
@@ -79,6 +82,8 @@ def sight(
     index = np.full(max([a.id for a in actors], default=0) + 1, -1)
     for k, actor in enumerate(actors):
         index[actor.id] = k
+    for k in np.flatnonzero(inside & np.array([a.kind in NARROW for a in actors], dtype=bool)).tolist():
+        amodal[k] = _narrowed(amodal[k], corners[k], camera, world_from_lidar)
     rows, columns = np.nonzero(owner)
     whose = index[owner[rows, columns]]
     pixels += np.bincount(whose, minlength=n)[:n]
@@ -89,6 +94,19 @@ def sight(
     for k in np.flatnonzero(inside & (pixels > 0)).tolist():
         hidden[k], truncated[k] = _coverage(camera, owner, actors[k].id, corners[k], boxes[k], world_from_lidar)
     return Sightings(visible, amodal, pixels, hidden, truncated)
+
+
+def _narrowed(
+    bounds: FloatArray, corners: NDArray[np.floating], camera: Camera, world_from_lidar: FloatArray
+) -> FloatArray:
+    """``bounds`` (4,) as wide as the outline of (T, 3, 3) world triangles, if all of it is before the camera."""
+    points = (corners.reshape(-1, 3) - world_from_lidar[:3, 3]) @ world_from_lidar[:3, :3]
+    pixels, depth = project_points(points, camera)
+    if (depth < NEAR * 5).any():
+        return bounds
+    result = bounds.copy()
+    result[[0, 2]] = np.clip([pixels[:, 0].min(), pixels[:, 0].max()], bounds[0], bounds[2])
+    return result
 
 
 def _coverage(
@@ -144,7 +162,7 @@ def occlusion_level(hidden: FloatArray) -> IntArray:
 def kitti_objects(
     actors: Sequence[Actor], boxes: FloatArray, sightings: Sightings, points_on: IntArray, camera: Camera
 ) -> KittiObjects:
-    """The label file of a frame, as seen by the left camera.
+    """The label file of a frame, as seen by the left camera; 2D boxes bound the whole object, as KITTI's do.
 
     An object is labelled when some of it is visible, it is high enough in the image, and a beam met it or it is
     near; what is visible but far, tiny or nearly covered becomes DontCare.
@@ -173,7 +191,7 @@ def kitti_objects(
         truncated,
         occluded.astype(np.int64),
         np.where(is_ignored, -10.0, alpha),
-        sightings.boxes2d[order],
+        np.where(is_ignored[:, None], sightings.boxes2d[order], sightings.amodal[order]),
         np.where(is_ignored[:, None], -1.0, dimensions),
         np.where(is_ignored[:, None], -1000.0, locations),
         np.where(is_ignored, -10.0, rotation),

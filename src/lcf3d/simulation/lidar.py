@@ -15,6 +15,7 @@ from lcf3d.simulation.materials import lidar_table
 from lcf3d.simulation.patterns import facade, road_mark
 from lcf3d.simulation.presets import LidarSpec
 from lcf3d.simulation.rays import Hits
+from lcf3d.simulation.response import respond
 
 Floats = NDArray[np.float32]
 _GLASS_PASSES = 3
@@ -100,6 +101,9 @@ def scan(spec: LidarSpec, stage: Stage, velocity: tuple[float, float], rain: flo
     )
     noise = rng.standard_normal((len(direction), 2), dtype=np.float32)
     measured = distance + noise[:, 0] * np.float32(spec.noise_m)
+    if spec.uneven_beams:
+        material = mesh.material[np.maximum(triangle, 0)]
+        intensity = respond(intensity, material, ring, len(spec.elevations_deg), rng)
     owner = np.where(triangle >= 0, stage.owner[triangle], 0).astype(np.int32)
     if rain:
         _droplets(rain, measured, intensity, kept, owner, rng)

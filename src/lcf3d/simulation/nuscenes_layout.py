@@ -12,7 +12,7 @@ import numpy as np
 from lcf3d.files import atomic_path, read_json, write_json, write_text
 from lcf3d.geometry.rotation import quaternions_from_matrices, quaternions_from_yaws
 from lcf3d.simulation.actors import NUSCENES_CLASS
-from lcf3d.simulation.frames import SimulatedFrame, attribute
+from lcf3d.simulation.frames import SimulatedFrame, attribute, capture, sensor_pose
 from lcf3d.simulation.kitti_layout import VAL_EVERY, write_bytes, write_png
 from lcf3d.simulation.presets import (
     NUSCENES_CAMERAS,
@@ -20,6 +20,7 @@ from lcf3d.simulation.presets import (
     ego_from_nuscenes_lidar,
     nuscenes_lidar_from_forward,
 )
+from lcf3d.structures import FloatArray
 
 VERSION: Final = "v1.0-simulated"
 START_US: Final = 1_600_000_000_000_000
@@ -66,31 +67,57 @@ def is_complete(root: Path, id: str) -> bool:
 
 
 def write_frame(root: Path, id: str, simulated: SimulatedFrame) -> None:
-    """Write the sensor files of a sample and, last, what the tables will say of it."""
+    """Write the sensor files of a sample, with the sweeps before it, and, last, what the tables will say of it."""
     drive, number = (int(v) for v in id.split("_"))
     timestamp = START_US + drive * 100_000_000 + round(simulated.time * 1e6)
     files = {"LIDAR_TOP": f"samples/LIDAR_TOP/simulated-{drive:04d}__LIDAR_TOP__{timestamp}.pcd.bin"}
     write_bytes(root / files["LIDAR_TOP"], _raw_points(simulated))
-    for camera in simulated.preset.cameras:
-        name = f"samples/{camera.name}/simulated-{drive:04d}__{camera.name}__{timestamp}.jpg"
+    preset, scene = simulated.preset, simulated.scene
+    own: dict[str, dict[str, Any]] = {}
+    for k, camera in enumerate(preset.cameras):
+        fired = timestamp + round(preset.delay(k) * 1e6)
+        if preset.camera_delays_s:
+            pose = sensor_pose(scene, preset, simulated.time + preset.delay(k))
+            own[camera.name] = {"timestamp": fired, "pose": _ego_pose(pose)}
+        name = f"samples/{camera.name}/simulated-{drive:04d}__{camera.name}__{fired}.jpg"
         _write_jpeg(root / name, simulated.renders[camera.name].image)
         files[camera.name] = name
-    pose = simulated.world_from_lidar @ np.linalg.inv(ego_from_nuscenes_lidar() @ nuscenes_lidar_from_forward())
     part = {
         "drive": drive,
         "number": number,
         "timestamp": timestamp,
         "street": simulated.scene.site.street.name,
         "files": files,
-        "pose": {
-            "translation": (pose[:3, 3] + _ORIGIN).tolist(),
-            "rotation": quaternions_from_matrices(pose[None, :3, :3])[0].tolist(),
-        },
+        "pose": _ego_pose(simulated.world_from_lidar),
+        "own": own,
+        "sweeps": _write_sweeps(root, drive, number, simulated),
         "sizes": {c.name: [c.width, c.height] for c in simulated.preset.cameras},
         "intrinsics": {c.name: c.intrinsics.tolist() for c in simulated.preset.cameras},
         "objects": _objects(simulated),
     }
     write_json(_part_path(root, id), part, indent=None)
+
+
+def _ego_pose(world_from_lidar: FloatArray) -> dict[str, list[float]]:
+    """Translation and rotation of the car, from the (4, 4) pose of its LiDAR."""
+    pose = world_from_lidar @ np.linalg.inv(ego_from_nuscenes_lidar() @ nuscenes_lidar_from_forward())
+    return {
+        "translation": (pose[:3, 3] + _ORIGIN).tolist(),
+        "rotation": quaternions_from_matrices(pose[None, :3, :3])[0].tolist(),
+    }
+
+
+def _write_sweeps(root: Path, drive: int, number: int, simulated: SimulatedFrame) -> list[dict[str, Any]]:
+    """The scans between the key frame before and this one, oldest first; none before the first of a drive."""
+    preset, result = simulated.preset, []
+    for k in range(preset.sweeps if number else 0, 0, -1):
+        time = simulated.time - k / preset.lidar.rate_hz
+        sweep = capture(simulated.scene, preset, time, (drive, number, 100 + k), "", images=False)
+        timestamp = START_US + drive * 100_000_000 + round(time * 1e6)
+        name = f"sweeps/LIDAR_TOP/simulated-{drive:04d}__LIDAR_TOP__{timestamp}.pcd.bin"
+        write_bytes(root / name, _raw_points(sweep))
+        result.append({"timestamp": timestamp, "filename": name, "pose": _ego_pose(sweep.world_from_lidar)})
+    return result
 
 
 def _raw_points(simulated: SimulatedFrame) -> bytes:
@@ -145,8 +172,9 @@ def write_tables(root: Path, ids: Iterable[str], seed: int) -> None:
         _drive_tables(tables, seed, drive, members)
     write_png(root / "maps" / "placeholder.png", np.zeros((4, 4, 3), dtype=np.uint8))
     names = [scene["name"] for scene in tables["scene"]]
+    every = min(VAL_EVERY, max(2, len(names)))
     for name, is_val in (("train", False), ("val", True)):
-        chosen = [n for k, n in enumerate(names) if (k % VAL_EVERY == VAL_EVERY - 1) == is_val]
+        chosen = [n for k, n in enumerate(names) if (k % every == every - 1) == is_val]
         write_text(root / f"{name}.txt", "".join(f"{n}\n" for n in chosen))
     for table, rows in tables.items():
         write_json(root / VERSION / f"{table}.json", rows, indent=0)
@@ -212,9 +240,6 @@ def _drive_tables(
     def sample_token(k: int) -> str:
         return token(seed, "sample", drive, members[k]["number"]) if 0 <= k < len(members) else ""
 
-    def data_token(k: int, channel: str) -> str:
-        return token(seed, "data", channel, drive, members[k]["number"]) if 0 <= k < len(members) else ""
-
     scene = token(seed, "scene", drive)
     tables["scene"].append(
         {
@@ -237,26 +262,48 @@ def _drive_tables(
                 "scene_token": scene,
             }
         )
-        for channel, filename in part["files"].items():
-            width, height = part["sizes"].get(channel, (0, 0))
-            tables["sample_data"].append(
-                {
-                    "token": data_token(k, channel),
-                    "sample_token": sample_token(k),
-                    "ego_pose_token": data_token(k, channel),
-                    "calibrated_sensor_token": token(seed, "calibration", channel),
-                    "timestamp": part["timestamp"],
-                    "fileformat": "pcd" if channel == "LIDAR_TOP" else "jpg",
-                    "is_key_frame": True,
-                    "height": height,
-                    "width": width,
-                    "filename": filename,
-                    "prev": data_token(k - 1, channel),
-                    "next": data_token(k + 1, channel),
-                }
-            )
-            tables["ego_pose"].append({"token": data_token(k, channel), "timestamp": part["timestamp"], **part["pose"]})
+    for channel in members[0]["files"]:
+        _data_tables(tables, seed, drive, members, channel, [sample_token(k) for k in range(len(members))])
     _annotation_tables(tables, seed, drive, members, [sample_token(k) for k in range(len(members))])
+
+
+def _data_tables(
+    tables: dict[str, list[dict[str, Any]]],
+    seed: int,
+    drive: int,
+    members: list[dict[str, Any]],
+    channel: str,
+    samples: list[str],
+) -> None:
+    """Append the files of one sensor and the poses of the car at their times, linked in order of time."""
+    chain = []
+    for sample, part in zip(samples, members, strict=True):
+        key = token(seed, "data", channel, drive, part["number"])
+        if channel == "LIDAR_TOP":
+            for k, sweep in enumerate(part["sweeps"]):
+                chain.append((token(seed, "sweep", drive, part["number"], k), sample, False, sweep))
+        own = part["own"].get(channel, {"timestamp": part["timestamp"], "pose": part["pose"]})
+        chain.append((key, sample, True, {**own, "filename": part["files"][channel]}))
+    width, height = members[0]["sizes"].get(channel, (0, 0))
+    names = ["", *(row[0] for row in chain), ""]
+    for k, (name, sample, is_key, row) in enumerate(chain):
+        tables["sample_data"].append(
+            {
+                "token": name,
+                "sample_token": sample,
+                "ego_pose_token": name,
+                "calibrated_sensor_token": token(seed, "calibration", channel),
+                "timestamp": row["timestamp"],
+                "fileformat": "pcd" if channel == "LIDAR_TOP" else "jpg",
+                "is_key_frame": is_key,
+                "height": height,
+                "width": width,
+                "filename": row["filename"],
+                "prev": names[k],
+                "next": names[k + 2],
+            }
+        )
+        tables["ego_pose"].append({"token": name, "timestamp": row["timestamp"], **row["pose"]})
 
 
 def _annotation_tables(

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lcf3d.errors import ConfigError
+from lcf3d.simulation.worlds import PLAIN, RICH, Mounting, World
 from lcf3d.structures import Camera
 
 Matrix = NDArray[np.float64]
@@ -29,6 +30,7 @@ class LidarSpec:
         height_m: above the ground.
         sensitivity: a beam returns with chance ``1 - exp(-4 sensitivity * reflected share / range^2)``.
         base_loss: share of beams lost for no visible reason.
+        uneven_beams: intensities with the zeros, low values and gains by beam of a real scanner.
     """
 
     elevations_deg: tuple[float, ...]
@@ -40,6 +42,7 @@ class LidarSpec:
     height_m: float
     sensitivity: float
     base_loss: float
+    uneven_beams: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +58,9 @@ class Preset:
         night: images by headlamps and street lamps.
         rate_hz: frames a second of a sequence.
         description: one line for the help.
+        world: what the streets hold beyond the ordinary.
+        camera_delays_s: when each camera fires, in seconds after the middle of the LiDAR's turn; empty for all at once.
+        sweeps: scans before every key frame but a drive's first that are written with it (nuScenes layout).
     """
 
     name: str
@@ -65,6 +71,13 @@ class Preset:
     night: bool
     rate_hz: float
     description: str
+    world: World = PLAIN
+    camera_delays_s: tuple[float, ...] = ()
+    sweeps: int = 0
+
+    def delay(self, number: int) -> float:
+        """Seconds after the middle of the LiDAR's turn at which a camera fires."""
+        return self.camera_delays_s[number] if self.camera_delays_s else 0.0
 
     def resized(self, factor: float, steps: int | None = None) -> Preset:
         """The same preset with images scaled by ``factor`` and fewer LiDAR firings, for tests and previews."""
@@ -208,6 +221,11 @@ def _nuscenes_cameras() -> tuple[Camera, ...]:
     return tuple(cameras)
 
 
+def _to_train_on(preset: Preset, name: str, description: str, world: World = RICH) -> Preset:
+    lidar = replace(preset.lidar, uneven_beams=True)
+    return replace(preset, name=name, lidar=lidar, world=world, description=description)
+
+
 @lru_cache(maxsize=1)
 def all_presets() -> dict[str, Preset]:
     """All presets by name."""
@@ -242,6 +260,25 @@ def all_presets() -> dict[str, Preset]:
         ),
         replace(kitti, name="sparse16", lidar=VLP16, description="kitti64 with a 16-beam LiDAR"),
         replace(kitti, name="rain", rain=0.7, description="kitti64 in rain: lost beams, droplets, wet road, haze"),
+        _to_train_on(
+            kitti, "train_kitti", "kitti64 to train on: many people and riders, hidden objects, uneven ground"
+        ),
+        _to_train_on(
+            replace(kitti, cameras=kitti.cameras[:1]), "train_mono", "train_kitti with the left camera only: quicker"
+        ),
+        replace(
+            nuscenes,
+            name="nuscenes_sweeps",
+            camera_delays_s=tuple(-yaw / 360 / HDL32.rate_hz for _, _, yaw, _ in NUSCENES_CAMERAS),
+            sweeps=9,
+            description="nuscenes32 with nine sweeps before a key frame, cameras that fire as the LiDAR passes them",
+        ),
+        _to_train_on(
+            nuscenes,
+            "train_nuscenes",
+            "nuscenes32 to train on: many people and riders, uneven ground",
+            replace(RICH, mounting=Mounting((0.0, 0.03), (0.0, 0.006), (0.0, 0.008))),
+        ),
         replace(kitti, name="night", night=True, description="kitti64 at night: head and street lamps"),
     )
     return {preset.name: preset for preset in every}

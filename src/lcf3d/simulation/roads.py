@@ -14,10 +14,19 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Terrain:
-    """A gently rolling surface; its slope stays below one per cent, so that upright boxes fit what stands on it."""
+    """A rolling surface.
+
+    Attributes:
+        phases: of the three long waves.
+        amplitude: of the long waves; up to 0.12 m the slope stays below one per cent.
+        hollows: (amplitude, phase, phase) of shorter waves, 60 to 80 m long.
+        slope: rise by metre along x and y.
+    """
 
     phases: tuple[float, float, float]
     amplitude: float
+    hollows: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    slope: tuple[float, float] = (0.0, 0.0)
 
     def height(self, x: ArrayLike, y: ArrayLike) -> Floats:
         """Height in metres at world positions."""
@@ -26,7 +35,30 @@ class Terrain:
         value: Floats = self.amplitude * (
             np.sin(x / 41 + a) + 0.6 * np.sin(y / 33 + b) + 0.5 * np.sin((x + y) / 57 + c)
         )
+        depth, d, e = self.hollows
+        if depth:
+            value = value + depth * np.sin(x / 13 + d) * np.sin(y / 11 + e)
+            value = value + self.slope[0] * x + self.slope[1] * y
         return value
+
+    def normal(self, x: float, y: float, reach_m: float = 1.4) -> Floats:
+        """(3,) unit normal of the surface at a place, from heights ``reach_m`` around it."""
+        ahead = self.height([x - reach_m, x + reach_m], y)
+        left = self.height(x, [y - reach_m, y + reach_m])
+        up = np.array([ahead[0] - ahead[1], left[0] - left[1], 2 * reach_m])
+        result: Floats = up / np.linalg.norm(up)
+        return result
+
+
+def make_terrain(rng: np.random.Generator, relief_m: float = 0.0) -> Terrain:
+    """Land that is almost flat, or rolls by up to about ``relief_m`` with a slope and hollows."""
+    phases, amplitude = tuple(rng.uniform(0, 6.28, 3)), float(rng.uniform(0.02, 0.12))
+    if not relief_m:
+        return Terrain(phases, amplitude)  # type: ignore[arg-type]
+    strength = float(rng.beta(1.2, 2.0))
+    hollows = (0.09 * strength * float(rng.uniform(0.2, 1.0)), *rng.uniform(0, 6.28, 2))
+    slope = tuple(0.03 * relief_m * rng.normal(size=2))
+    return Terrain(phases, 0.05 + relief_m * strength, hollows, slope)  # type: ignore[arg-type]
 
 
 class Path:
@@ -101,9 +133,10 @@ def open_ground(
     material: str,
     colour: tuple[float, float, float],
     lower: float,
+    lines: int = 41,
 ) -> Mesh:
     """The land below and around everything, fine near ``centre`` and coarse far away."""
-    near = np.linspace(-1, 1, 41)
+    near = np.linspace(-1, 1, lines)
     axis = np.sign(near) * np.abs(near) ** 1.6 * extent
     x, y = np.meshgrid(axis + centre[0], axis + centre[1], indexing="ij")
     far = np.clip(np.hypot(x - centre[0], y - centre[1]) / 150 - 1, 0, 1)

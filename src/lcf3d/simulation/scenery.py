@@ -8,11 +8,13 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from lcf3d.simulation.clutter import thing
 from lcf3d.simulation.meshes import street as build
 from lcf3d.simulation.meshes.primitives import Mesh
 from lcf3d.simulation.roads import Path, Terrain, open_ground, skyline, strip
 from lcf3d.simulation.roadside import BRICKS, ROOFS, WALLS, any_of, template
 from lcf3d.simulation.streets import StreetType
+from lcf3d.simulation.worlds import PLAIN, World
 
 Colour = tuple[float, float, float]
 
@@ -33,6 +35,7 @@ class Site:
         travel: metres that the sensors travel from arc length 0.
         crossings: (arc length, half width of the side street) of every side street.
         side_paths: centre lines of the side streets, one a crossing and side.
+        world: what the street holds beyond the ordinary.
     """
 
     street: StreetType
@@ -43,6 +46,7 @@ class Site:
     travel: float
     crossings: tuple[tuple[float, float], ...]
     side_paths: tuple[Path, ...]
+    world: World = PLAIN
 
     @property
     def lamps(self) -> list[tuple[float, float, float]]:
@@ -109,7 +113,25 @@ def build_scenery(site: Site, rng: np.random.Generator) -> Mesh:
         parts += _beside(site, side, rng)
     for number, path in enumerate(site.side_paths):
         parts += _side_street(site, path, site.crossings[number // 2][1], rng)
+    if site.world.clutter:
+        parts += _clutter(site, rng)
     return Mesh.join(parts)
+
+
+def _clutter(site: Site, rng: np.random.Generator) -> list[Mesh]:
+    """What detectors take for road users, put around the sensors: most on the pavement or verge, some far aside."""
+    parts = []
+    width = max(site.street.pavement + site.street.verge, 1.5)
+    for _ in range(int(rng.poisson(site.world.clutter))):
+        s = float(np.exp(rng.uniform(np.log(5), np.log(60)))) * float(rng.choice([1.0, 1.0, 1.0, -1.0]))
+        s += site.travel * float(rng.random())
+        if site.near_crossing(s, 1.0):
+            continue
+        aside = float(rng.uniform(0.35, width)) if rng.random() < 0.7 else width + float(rng.exponential(4.0))
+        lift = KERB if aside < site.street.pavement else -0.06  # grass and earth lie lower than the pavement
+        side = float(rng.choice([-1.0, 1.0]))
+        parts.append(_place(site, thing(rng), s, site.street.half_width + aside, side, lift))
+    return parts
 
 
 def _place(
@@ -126,7 +148,15 @@ def _ground(site: Site, rng: np.random.Generator) -> list[Mesh]:
     centre = (float(x), float(y))
     green = np.array([0.080, 0.100, 0.038]) * rng.uniform(0.85, 1.2)
     return [
-        open_ground(site.terrain, centre, 460.0, "grass", (green[0], green[1], green[2]), 0.06),
+        open_ground(
+            site.terrain,
+            centre,
+            460.0,
+            "grass",
+            (green[0], green[1], green[2]),
+            0.06,
+            101 if site.world.is_uneven else 41,
+        ),
         skyline(centre, rng),
     ]
 
@@ -137,7 +167,9 @@ def _surfaces(site: Site) -> list[Mesh]:
     grey = (0.115, 0.115, 0.118) if street.paving == "asphalt" else (0.22, 0.205, 0.19)
     lanes = (-w, -w / 2, 0.0, w / 2, w)
     whole = (site.first, site.last)
-    parts = [strip(site.path, site.terrain, whole, lanes, (0.0,) * 5, street.paving, grey)]
+    middle = site.world.crown * w  # the edges keep the height of the terrain, where kerbs and side streets meet them
+    camber = (0.0, middle / 2, middle, middle / 2, 0.0)
+    parts = [strip(site.path, site.terrain, whole, lanes, camber, street.paving, grey)]
     slab = (0.25, 0.245, 0.235)
     lowest = -0.02 if street.pavement == 0 else KERB
     outer = w + street.pavement

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,8 @@ from lcf3d.simulation.roads import Path
 from lcf3d.simulation.scenery import Site
 
 _TRIES = 12
+ALWAYS_PLACED: Final = 5.0
+"""Up to this density a street takes whom it can hold; beyond, one that cannot hold half of them is refused."""
 
 
 @dataclass
@@ -28,6 +31,8 @@ class Crowd:
         duration: seconds over which actors must keep clear.
         rng: random numbers.
         ego: how the sensors' car moves.
+        large: factor on the share of vehicles that are no cars.
+        varied: people with clothes and a gait of their own.
         actors: what has been placed.
         refused: how many could not be placed.
     """
@@ -38,6 +43,8 @@ class Crowd:
     duration: float
     rng: np.random.Generator
     ego: Motion
+    large: float = 1.0
+    varied: bool = False
     actors: list[Actor] = field(default_factory=list)
     refused: int = 0
 
@@ -75,42 +82,32 @@ class Crowd:
             if self._is_clear(m, size, track, margin):
                 fine = bool(np.linalg.norm(track[:, 0, :2] - self._ego_track[:, 0, :2], axis=1).min() < 40.0)
                 id = len(self.actors) + 1
-                self.actors.append(make_actor(id, kind, m, self.rng, self.dataset, size, stopped, fine))
+                self.actors.append(make_actor(id, kind, m, self.rng, self.dataset, size, stopped, fine, self.varied))
                 self._discs = np.concatenate([self._discs, track], axis=1)
                 return True
         self.refused += 1
         return False
 
 
-def populate(
-    site: Site,
-    obstacles: ObstacleMap,
-    ego: Motion,
-    dataset: str,
-    duration: float,
-    density: float,
-    rng: np.random.Generator,
-) -> list[Actor]:
-    """Road users of a street; ``density`` multiplies their number.
+def populate(crowd: Crowd, density: float) -> None:
+    """Add the ordinary road users of a street; ``density`` multiplies their number.
 
     Raises:
-        ConfigError: more than asked for as usual, and over half of them find no free place.
+        ConfigError: many times more than usual are asked for, and over half of them find no free place.
     """
-    crowd = Crowd(site, obstacles, dataset, duration, rng, ego)
     _moving_traffic(crowd, density)
     _parked(crowd, density)
     _side_traffic(crowd, density)
     _people(crowd, density)
     _two_wheelers(crowd, density)
-    if rng.random() < (0.30 if dataset == "nuscenes" else 0.10):
+    if crowd.rng.random() < (0.30 if crowd.dataset == "nuscenes" else 0.10):
         _road_works(crowd)
-    # at the usual density a street that turns out narrow is just an emptier street
-    if density > 1 and crowd.refused > max(6, len(crowd.actors)):
+    # at ordinary densities a street that turns out narrow is just an emptier street
+    if density > ALWAYS_PLACED and crowd.refused > max(6, len(crowd.actors)):
         raise ConfigError(
             f"only {len(crowd.actors)} of {len(crowd.actors) + crowd.refused} road users found a free place on a "
-            f"street of type {site.street.name!r}; use a density below {density:g}"
+            f"street of type {crowd.site.street.name!r}; use a density below {density:g}"
         )
-    return crowd.actors
 
 
 def _count(rng: np.random.Generator, mean: float) -> int:
@@ -118,7 +115,8 @@ def _count(rng: np.random.Generator, mean: float) -> int:
     return int(rng.poisson(mean * rng.gamma(1.6, 1 / 1.6)))
 
 
-def _vehicle_kind(crowd: Crowd, parked: bool) -> str:
+def vehicle_kind(crowd: Crowd, parked: bool) -> str:
+    """A kind of vehicle, drawn by its frequency among those that are parked or move."""
     kinds = ["car", "van", "truck", "bus", "tram", "trailer", "construction_vehicle", "cart"]
     if crowd.dataset == "nuscenes":
         shares = [0.80, 0.05, 0.08, 0.025, 0.0, 0.02, 0.015, 0.01]
@@ -128,6 +126,8 @@ def _vehicle_kind(crowd: Crowd, parked: bool) -> str:
             if parked
             else [0.80, 0.065, 0.035, 0.012, 0.012, 0.006, 0.0, 0.01]
         )
+    if crowd.large != 1:
+        shares = [shares[0], *(crowd.large * share for share in shares[1:])]
     return str(crowd.rng.choice(kinds, p=np.array(shares) / sum(shares)))
 
 
@@ -141,7 +141,7 @@ def _moving_traffic(crowd: Crowd, density: float) -> None:
             speed = abs(crowd.ego.speed) if direction > 0 else street.speed * float(rng.uniform(0.6, 1.2))
             standing = speed < 0.5
             for _ in range(_count(rng, street.moving_per_100m * length * density / street.lanes)):
-                kind = _vehicle_kind(crowd, False)
+                kind = vehicle_kind(crowd, False)
 
                 def motion(direction: float = direction, lane: float = lane, speed: float = speed) -> Motion:
                     s = float(rng.uniform(site.first + 8, site.last - 8))
@@ -180,7 +180,7 @@ def _parked(crowd: Crowd, density: float) -> None:
             place = side * (street.half_width + street.pavement + street.verge + float(rng.uniform(2.5, 8)))
             for k in range(int(rng.integers(1, 5))):
                 crowd.add(
-                    _vehicle_kind(crowd, True),
+                    vehicle_kind(crowd, True),
                     lambda k=k, s=s, p=place, t=turn: Motion(site.path, s + 2.9 * k, p, 0.0, t),
                 )
 
@@ -188,7 +188,7 @@ def _parked(crowd: Crowd, density: float) -> None:
 def _park(crowd: Crowd, s: float, offset: float, side: float) -> None:
     rng = crowd.rng
     facing = 0.0 if (side < 0) == (rng.random() < 0.85) else np.pi
-    kind = _vehicle_kind(crowd, True)
+    kind = vehicle_kind(crowd, True)
 
     def motion() -> Motion:
         return Motion(
@@ -211,7 +211,7 @@ def _side_traffic(crowd: Crowd, density: float) -> None:
         half = site.crossings[number // 2][1]
         if rng.random() < 0.45 * density:
             crowd.add(
-                _vehicle_kind(crowd, False),
+                vehicle_kind(crowd, False),
                 lambda p=path, h=half: Motion(
                     p, site.street.half_width + float(rng.uniform(4.5, 14)), h * 0.5, 0.0, np.pi
                 ),
@@ -221,7 +221,7 @@ def _side_traffic(crowd: Crowd, density: float) -> None:
         for _ in range(_count(rng, 2.0 * density)):
             side = float(rng.choice([-1.0, 1.0]))
             crowd.add(
-                _vehicle_kind(crowd, True),
+                vehicle_kind(crowd, True),
                 lambda p=path, h=half, q=side: Motion(
                     p,
                     float(rng.uniform(site.building_line + 4, p.last - 6)),

@@ -10,12 +10,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lcf3d.errors import ConfigError
 from lcf3d.structures import IntArray
 from lcf3d.training.camera_augmentation import Augmentation, draw_view
 from lcf3d.training.camera_evaluation import evaluate_detector
-from lcf3d.training.camera_images import LabelledImage
+from lcf3d.training.camera_images import ABSENT, LabelledImage
 from lcf3d.training.loop import import_torch
 
 if TYPE_CHECKING:
@@ -69,14 +70,13 @@ class CameraTask:
         torch = import_torch()
         chosen = [self._draw(rng) for _ in range(self.batch_size)]
         views = [draw_view(self.images[i], self.view, self.augmentation, rng) for i in chosen]
-        counts = [len(view.labels) for view in views]
+        most = max(1, *(len(view.labels) for view in views))
         batch = {
             "pixels": np.stack([view.image for view in views]).transpose(0, 3, 1, 2),
-            "image": np.repeat(np.arange(len(views)), counts),
-            "boxes": np.concatenate([view.boxes for view in views]).astype(np.float32),
-            "visible": np.concatenate([view.visible for view in views]).astype(np.float32),
-            "labels": np.concatenate([view.labels for view in views]),
-            "numbers": np.concatenate([view.numbers for view in views]),
+            "boxes": np.stack([padded(view.boxes.astype(np.float32), most, 0) for view in views]),
+            "visible": np.stack([padded(view.visible.astype(np.float32), most, 0) for view in views]),
+            "labels": np.stack([padded(view.labels, most, ABSENT) for view in views]),
+            "numbers": np.stack([padded(view.numbers, most, 0) for view in views]),
         }
         if self.config.prototypes:
             batch["owner"] = np.stack([view.owner for view in views if view.owner is not None])
@@ -99,14 +99,7 @@ class CameraTask:
         from lcf3d.training.camera_losses import Targets, losses
 
         outputs = network(batch["pixels"].float() / 255)
-        targets = Targets(
-            batch["image"],
-            batch["boxes"],
-            batch["visible"],
-            batch["labels"],
-            batch.get("owner"),
-            batch["numbers"],
-        )
+        targets = Targets(batch["boxes"], batch["visible"], batch["labels"], batch.get("owner"), batch["numbers"])
         return losses(outputs, targets, self.view)
 
     def validate(self, network: Any) -> dict[str, float]:
@@ -121,3 +114,10 @@ class CameraTask:
             export_small(network, path)
             detector = OnnxDetector(path, score_threshold=0.02, threads=1)
             return evaluate_detector(detector, self.held_out).figures()
+
+
+def padded(values: NDArray[Any], rows: int, filling: float) -> NDArray[Any]:
+    """Values with ``rows`` rows: cut, or filled up."""
+    result = np.full((rows, *values.shape[1:]), filling, dtype=values.dtype)
+    result[: len(values)] = values[:rows]
+    return result

@@ -17,8 +17,8 @@ from lcf3d.formats.kitti import read_objects
 from lcf3d.structures import KITTI_CLASSES, FloatArray, IntArray
 from lcf3d.training.samples import ImageSample, read_image
 
-IGNORED = -1
-"""Label of objects that are neither to be found nor background."""
+IGNORED, ABSENT = -1, -2
+"""Label of objects that are neither to be found nor background, and of rows without an object."""
 # objects of which more is covered are neither demanded nor forbidden
 MOST_HIDDEN = 0.85
 # vans are cars; who sits may be found or not; trucks, trams and the rest are background that must not be found

@@ -13,6 +13,7 @@ from typing import Any
 from lcf3d.detectors.camera.onnx_layouts import STRIDES
 from lcf3d.detectors.camera.small_network import PROTOTYPE_STRIDE, SmallOutputs
 from lcf3d.networks.torch import Tensor, functional, torch
+from lcf3d.training.camera_images import IGNORED
 
 # cells that learn an object, and the powers of score and overlap in their choice
 MOST_CELLS, SCORE_POWER, OVERLAP_POWER = 10, 0.5, 4.0
@@ -22,23 +23,21 @@ FLOOR = 0.5
 REACH = 6.0
 BOX_WEIGHT, MASK_WEIGHT = 4.0, 1.5
 # masks learned a batch; more cost time and say the same
-MOST_MASKS = 32
+MOST_MASKS, MASKS_AN_IMAGE = 32, 4
 
 
 @dataclass(frozen=True)
 class Targets:
-    """Objects of a batch, of all images one after the other.
+    """Objects of a batch, as many rows an image as the fullest has.
 
     Attributes:
-        image: (N,) image of each object in the batch.
-        boxes: (N, 4) corners in pixels of the input.
-        visible: (N, 4) bounds of what can be seen.
-        labels: (N,) classes, below zero for objects to ignore.
-        owner: (B, H, W) uint8 number of the object in each pixel, or None without masks.
-        numbers: (N,) uint8 numbers of the objects in ``owner``.
+        boxes: (B, N, 4) corners in pixels of the input.
+        visible: (B, N, 4) bounds of what can be seen.
+        labels: (B, N) classes, `IGNORED` for objects to ignore, `ABSENT` for rows without one.
+        owner: (B, H, W) number of the object in each pixel, or None without masks.
+        numbers: (B, N) numbers of the objects in ``owner``.
     """
 
-    image: Tensor
     boxes: Tensor
     visible: Tensor
     labels: Tensor
@@ -48,16 +47,16 @@ class Targets:
 
 @dataclass(frozen=True)
 class Assignment:
-    """Which cells of an image learn which objects.
+    """Which cells learn which objects.
 
     Attributes:
-        cells: (P,) cells that answer for an object.
-        objects: (P,) the object of each.
-        quality: (P,) the score each shall have, 0 to 1.
-        ignored: (M,) bool, cells whose scores are not taught.
+        owned: (B, M) bool, cells that answer for an object.
+        objects: (B, M) row of the object of each, 0 for none.
+        quality: (B, M) the score each shall have, 0 to 1.
+        ignored: (B, M) bool, cells whose scores are not taught.
     """
 
-    cells: Tensor
+    owned: Tensor
     objects: Tensor
     quality: Tensor
     ignored: Tensor
@@ -71,29 +70,21 @@ def losses(outputs: SmallOutputs, targets: Targets, size: tuple[int, int]) -> di
         targets: the objects.
         size: (height, width) of the input.
     """
-    centres = cell_centres(size, outputs.boxes)
-    wanted = torch.zeros_like(outputs.logits)
-    taught = torch.ones_like(outputs.logits[..., :1])
-    found: list[tuple[int, Assignment, Tensor]] = []
-    for index in range(len(outputs.logits)):
-        rows = torch.nonzero(targets.image == index)[:, 0]
-        if not len(rows):
-            continue
-        assigned = assign(outputs, targets, index, rows, centres)
-        taught[index, assigned.ignored] = 0
-        labels = targets.labels[rows[assigned.objects]]
-        wanted[index, assigned.cells, labels] = assigned.quality
-        found.append((index, assigned, rows[assigned.objects]))
+    assigned = assign(outputs, targets, cell_centres(size, outputs.boxes))
+    labels = targets.labels.clamp(min=0).gather(1, assigned.objects)
+    wanted = torch.zeros_like(outputs.logits).scatter_(2, labels[..., None], assigned.quality[..., None])
     total = wanted.sum().clamp(min=1.0)
     scores = functional.binary_cross_entropy_with_logits(outputs.logits, wanted, reduction="none")
-    terms = {"score": (scores * taught).sum() / total, "box": outputs.boxes.sum() * 0}
-    if found:
-        predicted = torch.cat([outputs.boxes[index, a.cells] for index, a, _ in found])
-        true = torch.cat([targets.boxes[objects] for _, _, objects in found])
-        weights = torch.cat([a.quality for _, a, _ in found])
-        terms["box"] = BOX_WEIGHT * ((1 - generalized_iou(predicted, true)) * weights).sum() / total
+    true = targets.boxes.gather(1, assigned.objects[..., None].expand(-1, -1, 4))
+    shift = 1 - generalized_iou(outputs.boxes.flatten(0, 1), true.flatten(0, 1)).reshape(assigned.quality.shape)
+    # where nothing is to be learned the true box is another object's, or none
+    shift = torch.where(assigned.owned, shift, torch.zeros_like(shift))
+    terms = {
+        "score": (scores * ~assigned.ignored[..., None]).sum() / total,
+        "box": BOX_WEIGHT * (shift * assigned.quality).sum() / total,
+    }
     if targets.owner is not None and outputs.prototypes is not None:
-        terms["mask"] = MASK_WEIGHT * mask_loss(outputs, targets, found)
+        terms["mask"] = MASK_WEIGHT * mask_loss(outputs, targets, assigned)
     return terms
 
 
@@ -110,42 +101,39 @@ def cell_centres(size: tuple[int, int], like: Tensor) -> Tensor:
     return torch.cat(parts).to(like.dtype)
 
 
-def assign(outputs: SmallOutputs, targets: Targets, index: int, rows: Tensor, centres: Tensor) -> Assignment:
-    """Cells of image ``index`` for the objects ``rows`` of the targets; a cell answers for one object at most."""
+def assign(outputs: SmallOutputs, targets: Targets, centres: Tensor) -> Assignment:
+    """Cells for the objects of every image; a cell answers for one object at most."""
     with torch.no_grad():
-        visible, labels = targets.visible[rows], targets.labels[rows]
-        middle, half = (visible[:, :2] + visible[:, 2:]) / 2, (visible[:, 2:] - visible[:, :2]) / 2
-        near = ((centres[None] - middle[:, None]).abs() < half.clamp(min=REACH)[:, None]).all(dim=2)
-        objects = torch.nonzero(labels >= 0)[:, 0]
-        ignored = near[labels < 0].any(dim=0)
-        if not len(objects):
-            return Assignment(objects, objects, centres.new_zeros(0), ignored)
-        near = near[objects]
-        overlap = pairwise_iou(targets.boxes[rows[objects]], outputs.boxes[index]) * near
-        scores = outputs.logits[index].sigmoid().T[labels[objects]]
-        alignment = scores**SCORE_POWER * overlap**OVERLAP_POWER * near
-        best = alignment.topk(min(MOST_CELLS, alignment.shape[1]), dim=1).indices
-        chosen = torch.zeros_like(alignment).scatter_(1, best, 1.0) * (alignment > 0)
+        visible, labels = targets.visible, targets.labels
+        middle, half = (visible[..., :2] + visible[..., 2:]) / 2, (visible[..., 2:] - visible[..., :2]) / 2
+        near = ((centres - middle[:, :, None]).abs() < half.clamp(min=REACH)[:, :, None]).all(dim=3)
+        ignored = (near & (labels == IGNORED)[..., None]).any(dim=1)
+        near = near & (labels >= 0)[..., None]
+        overlap = pairwise_iou(targets.boxes, outputs.boxes) * near
+        of_class = labels.clamp(min=0)[..., None].expand(-1, -1, outputs.logits.shape[1])
+        scores = outputs.logits.sigmoid().transpose(1, 2).gather(1, of_class)
+        alignment = scores**SCORE_POWER * overlap**OVERLAP_POWER
+        best = alignment.topk(min(MOST_CELLS, alignment.shape[2]), dim=2).indices
+        chosen = torch.zeros_like(near).scatter_(2, best, value=True) & (alignment > 0)
         # a cell that several objects want goes to the one it overlaps most
-        winner = (overlap * chosen).argmax(dim=0)
-        cells = torch.nonzero(chosen.any(dim=0))[:, 0]
-        owners = winner[cells]
-        aligned = torch.zeros_like(alignment)
-        aligned[owners, cells] = alignment[owners, cells]
-        highest = aligned.amax(dim=1).clamp(min=1e-9)
-        reached = torch.zeros_like(highest).scatter_reduce_(0, owners, overlap[owners, cells], "amax")
-        quality = aligned[owners, cells] / highest[owners] * (FLOOR + (1 - FLOOR) * reached[owners])
-        ignored[cells] = False
-        return Assignment(cells, objects[owners], quality, ignored)
+        objects = (overlap * chosen).argmax(dim=1)
+        owned = chosen.any(dim=1)
+        rows = torch.arange(labels.shape[1], device=labels.device)[None, :, None]
+        own = chosen & (rows == objects[:, None])
+        aligned = alignment * own
+        highest = aligned.amax(dim=2, keepdim=True).clamp(min=1e-9)
+        reached = (overlap * own).amax(dim=2, keepdim=True)
+        quality = (aligned / highest * (FLOOR + (1 - FLOOR) * reached)).sum(dim=1)
+        return Assignment(owned, objects, quality, ignored & ~owned)
 
 
 def pairwise_iou(a: Tensor, b: Tensor) -> Tensor:
-    """(N, M) IoU of (N, 4) and (M, 4) boxes."""
-    low = torch.maximum(a[:, None, :2], b[None, :, :2])
-    high = torch.minimum(a[:, None, 2:], b[None, :, 2:])
-    common = (high - low).clamp(min=0).prod(dim=2)
-    total = (a[:, 2:] - a[:, :2]).prod(dim=1)[:, None] + (b[:, 2:] - b[:, :2]).prod(dim=1)[None] - common
-    iou: Tensor = common / total.clamp(min=1e-6)
+    """(..., N, M) IoU of (..., N, 4) and (..., M, 4) boxes."""
+    low = torch.maximum(a[..., :, None, :2], b[..., None, :, :2])
+    high = torch.minimum(a[..., :, None, 2:], b[..., None, :, 2:])
+    common = (high - low).clamp(min=0).prod(dim=-1)
+    total = (a[..., 2:] - a[..., :2]).prod(dim=-1)[..., :, None] + (b[..., 2:] - b[..., :2]).prod(dim=-1)[..., None, :]
+    iou: Tensor = common / (total - common).clamp(min=1e-6)
     return iou
 
 
@@ -159,28 +147,26 @@ def generalized_iou(a: Tensor, b: Tensor) -> Tensor:
     return value
 
 
-def mask_loss(outputs: SmallOutputs, targets: Targets, found: list[tuple[int, Assignment, Tensor]]) -> Tensor:
+def mask_loss(outputs: SmallOutputs, targets: Targets, assigned: Assignment) -> Tensor:
     """Cross-entropy and overlap (dice) of masks inside their boxes, over a random part of the cells with an object."""
     assert outputs.prototypes is not None
     assert targets.owner is not None
-    terms = [outputs.prototypes.sum() * 0]
-    count = sum(len(a.cells) for _, a, _ in found)
-    share = min(1.0, MOST_MASKS / max(1, count))
-    for index, assigned, objects in found:
-        drawn = torch.randperm(len(objects))[: max(1, round(share * len(objects)))].to(objects.device)
-        logits = torch.einsum(
-            "nk,khw->nhw", outputs.coefficients[index, assigned.cells[drawn]], outputs.prototypes[index]
-        )
-        rows = objects[drawn]
-        of_object = (targets.owner[index][None] == targets.numbers[rows][:, None, None]).to(logits.dtype)
-        wanted = functional.avg_pool2d(of_object[:, None], PROTOTYPE_STRIDE)[:, 0]
-        inside = box_masks(targets.boxes[rows] / PROTOTYPE_STRIDE, logits.shape[1:], logits)
-        area = inside.sum(dim=(1, 2)).clamp(min=1.0)
-        entropy = functional.binary_cross_entropy_with_logits(logits, wanted, reduction="none") * inside
-        shares, wanted = logits.sigmoid() * inside, wanted * inside
-        dice = 1 - (2 * (shares * wanted).sum(dim=(1, 2)) + 1) / ((shares + wanted).sum(dim=(1, 2)) + 1)
-        terms.append((entropy.sum(dim=(1, 2)) / area + dice).sum() / max(1.0, count * share))
-    total: Tensor = torch.stack(terms).sum()
+    images, cells = assigned.owned.shape
+    most = min(max(MOST_MASKS, MASKS_AN_IMAGE * images), images * cells)
+    # random cells with an object first, then cells without, which do not count
+    drawn = (torch.rand(images * cells, device=assigned.owned.device) * assigned.owned.flatten()).topk(most).indices
+    counted = assigned.owned.flatten()[drawn].to(outputs.prototypes.dtype)
+    image, cell = drawn // cells, drawn % cells
+    rows = assigned.objects[image, cell]
+    logits = torch.einsum("nk,nkhw->nhw", outputs.coefficients[image, cell], outputs.prototypes[image])
+    of_object = (targets.owner[image] == targets.numbers[image, rows][:, None, None]).to(logits.dtype)
+    wanted = functional.avg_pool2d(of_object[:, None], PROTOTYPE_STRIDE)[:, 0]
+    inside = box_masks(targets.boxes[image, rows] / PROTOTYPE_STRIDE, logits.shape[1:], logits)
+    area = inside.sum(dim=(1, 2)).clamp(min=1.0)
+    entropy = functional.binary_cross_entropy_with_logits(logits, wanted, reduction="none") * inside
+    shares, wanted = logits.sigmoid() * inside, wanted * inside
+    dice = 1 - (2 * (shares * wanted).sum(dim=(1, 2)) + 1) / ((shares + wanted).sum(dim=(1, 2)) + 1)
+    total: Tensor = ((entropy.sum(dim=(1, 2)) / area + dice) * counted).sum() / counted.sum().clamp(min=1.0)
     return total
 
 

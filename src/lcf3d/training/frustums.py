@@ -20,7 +20,7 @@ from lcf3d.geometry.boxes import lidar_from_kitti, points_in_boxes, transform_bo
 from lcf3d.geometry.camera import NEAR, project_boxes, project_points
 from lcf3d.geometry.iou import image_iou
 from lcf3d.structures import BoolArray, Camera, Detections3D, FloatArray, IntArray
-from lcf3d.training.samples import read_scan
+from lcf3d.training.samples import ScanSample, read_scan
 
 WIDE = 0.45
 """Growth of the boxes for the pool: room for jitter and for the enlargement of proposals."""
@@ -29,6 +29,9 @@ FEWEST_ON_OBJECT = 5
 LOWEST_PX = 12.0
 NEGATIVE_SHARE = 0.2
 FREE_IOU = 0.1
+EDGE_EVERY = 3
+"""Of so many headings of a simulated scan one has a near object at the image's edge."""
+NEAREST_AT_EDGE_M, FARTHEST_AT_EDGE_M = 3.0, 25.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +45,7 @@ class LabelledScene:
         camera: the camera.
         right: the second camera of a stereo pair, if there is one.
         boxes2d: (A, 4) annotated 2D boxes; those of the projected 3D boxes without them.
+        unknown2d: (D, 4) regions of which nobody says what they hold, if there are any.
     """
 
     points: NDArray[np.float32]
@@ -50,6 +54,7 @@ class LabelledScene:
     camera: Camera
     right: Camera | None = None
     boxes2d: FloatArray | None = None
+    unknown2d: FloatArray | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,8 +136,9 @@ def frustums_of(scene: LabelledScene, classes: Mapping[str, int], rng: np.random
     objects = [_cut(scene, boxes2d[k], right_boxes[k], int(labels[k]), scene.boxes[k]) for k in rows]
     kept = [f for f in objects if f.inside.sum() >= FEWEST_ON_OBJECT]
     nothing = np.full(7, np.nan)
+    taken = boxes2d[visible] if scene.unknown2d is None else np.concatenate([boxes2d[visible], scene.unknown2d])
     for _ in range(rng.binomial(len(kept), NEGATIVE_SHARE)):
-        box, label = _free_box(boxes2d[visible], kept[rng.integers(len(kept))], scene.camera, rng)
+        box, label = _free_box(taken, kept[rng.integers(len(kept))], scene.camera, rng)
         if box is not None:
             empty = _cut(scene, box, np.full(4, np.nan), label, nothing)
             if len(empty.points) >= 2 * FEWEST_ON_OBJECT:
@@ -196,7 +202,23 @@ def scenes_of_samples(
         rng = np.random.default_rng([seed, number])
         for k, angle in enumerate(rng.uniform(0, 2 * np.pi) + np.arange(views) * 2 * np.pi / views):
             left, right = cameras[(number + k) % len(cameras)]
+            if k % EDGE_EVERY == EDGE_EVERY - 1:
+                angle = _edge_angle(sample, left, rng, float(angle))
             yield turned_scene(LabelledScene(sample.points, sample.boxes, sample.names, left, right), float(angle))
+
+
+def _edge_angle(sample: ScanSample, camera: Camera, rng: np.random.Generator, otherwise: float) -> float:
+    """A turn that brings the edge of the image across a near object; ``otherwise`` where nothing is near."""
+    distance = np.hypot(sample.boxes[:, 0], sample.boxes[:, 1])
+    near = np.flatnonzero((distance > NEAREST_AT_EDGE_M) & (distance < FARTHEST_AT_EDGE_M))
+    if not len(near):
+        return otherwise
+    chosen = rng.choice(near)
+    x, y = sample.boxes[chosen, :2]
+    column = float(rng.choice([0, camera.width]))
+    ray = np.linalg.solve(camera.intrinsics, [column, camera.height / 2, 1.0]) @ camera.camera_from_lidar[:3, :3]
+    half = np.arctan2(0.5 * np.hypot(*sample.boxes[chosen, 3:5]), distance[chosen])
+    return float(np.arctan2(ray[1], ray[0]) - np.arctan2(y, x) + rng.uniform(-0.8, 0.8) * half)
 
 
 def scenes_of_dataset(text: str, split: str | None) -> Iterator[LabelledScene]:
@@ -220,11 +242,12 @@ def scenes_of_dataset(text: str, split: str | None) -> Iterator[LabelledScene]:
         frame = kitti.frame(frame_id)
         points, _ = _labelled(frame.points, frame.labels, frame_id)
         objects = read_objects(kitti.folder / "label_2" / f"{frame_id}.txt", results=False)
+        unknown = objects.boxes2d[objects.class_names == "DontCare"]
         objects = objects[objects.has_box3d]
         camera = frame.camera("left")
         right = next((c for c in frame.cameras if c.name == "right"), None)
         boxes = lidar_from_kitti(objects.locations, objects.dimensions, objects.rotation_y, camera.camera_from_lidar)
-        yield LabelledScene(points, boxes, objects.class_names, camera, right, objects.boxes2d)
+        yield LabelledScene(points, boxes, objects.class_names, camera, right, objects.boxes2d, unknown)
 
 
 def _labelled(

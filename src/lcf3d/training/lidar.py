@@ -26,7 +26,7 @@ from lcf3d.training.lidar_augmentation import (
     collect_objects,
     crop,
 )
-from lcf3d.training.lidar_scans import LabelledScan, ScanSource
+from lcf3d.training.lidar_scans import LabelledScan, ScanSource, levelled_scan
 from lcf3d.training.lidar_targets import center_losses, center_targets
 from lcf3d.training.loop import import_torch
 
@@ -78,7 +78,7 @@ class LidarTask:
         windows = []
         for number in range(self.batch_size):
             if number % self.windows_a_scan == 0:
-                scan = self.scans.read(int(rng.integers(self.scans.count)))
+                scan = levelled_scan(self.scans.read(int(rng.integers(self.scans.count))), self.config)
                 scan = augment(scan, spec.area, self.scans.turn, self.objects, self.augmentation, rng)
             windows.append((scan, choose_window(scan, spec, stride, self.window, rng)))
         return collate(windows, self.config)
@@ -125,7 +125,8 @@ def collate(windows: Sequence[tuple[LabelledScan, VoxelSpec]], config: LidarConf
 def objects_of(scans: ScanSource, config: LidarConfig, limit: int = 1500, seed: int = 0) -> ObjectDatabase:
     """Objects to paste, at most ``limit`` a class, from the scans of a source in random order."""
     order = np.random.default_rng([seed, 1]).permutation(scans.count)
-    return collect_objects(scans, len(config.class_names), limit, order.tolist())
+    level = ScanSource(lambda number: levelled_scan(scans.read(number), config), scans.count, scans.turn)
+    return collect_objects(level, len(config.class_names), limit, order.tolist())
 
 
 def checkpoint_detector(path: Path, config: LidarConfig = COMPACT_KITTI, **options: Any) -> Any:

@@ -90,7 +90,7 @@ def collect_objects(
             label = int(scan.labels[k])
             if found[label] < limit:
                 found[label] += 1
-                kept.append((_inside(scan.points, scan.boxes[k])[:MOST_POINTS_OF_OBJECT], scan.boxes[k], label))
+                kept.append((cut_out(scan.points, scan.boxes[k]), scan.boxes[k], label))
     labels = np.array([label for _, _, label in kept], dtype=np.int64)
     boxes = np.array([box for _, box, _ in kept], dtype=np.float64).reshape(-1, 7)
     members = tuple(np.flatnonzero(labels == label) for label in range(classes))
@@ -128,7 +128,9 @@ def augment(
     gain = rng.uniform(1 - settings.intensity_gain, 1 + settings.intensity_gain)
     offset = rng.uniform(0, settings.intensity_offset)
     noise = rng.normal(0, settings.intensity_noise, len(points))
-    points[:, 3] = np.clip(points[:, 3] * gain + offset + noise, 0, 1)
+    # nuScenes counts to 255
+    top = 1.0 if points[:, 3].max(initial=0) <= 1 else 255.0
+    points[:, 3] = np.clip(points[:, 3] * gain + (offset + noise) * top, 0, top)
     return crop(replace(scan, points=points), area)
 
 
@@ -285,5 +287,9 @@ def _within(points: NDArray[np.float32], box: FloatArray) -> NDArray[np.int64]:
     return inside
 
 
-def _inside(points: NDArray[np.float32], box: FloatArray) -> NDArray[np.float32]:
-    return points[_within(points, box)]
+def cut_out(points: NDArray[np.float32], box: FloatArray) -> NDArray[np.float32]:
+    """The points inside a box; of more than `MOST_POINTS_OF_OBJECT` an even selection, no side missing."""
+    inside = _within(points, box)
+    if len(inside) > MOST_POINTS_OF_OBJECT:
+        inside = inside[np.linspace(0, len(inside) - 1, MOST_POINTS_OF_OBJECT).astype(np.int64)]
+    return points[inside]

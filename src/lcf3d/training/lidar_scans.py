@@ -13,9 +13,12 @@ from numpy.typing import NDArray
 
 from lcf3d.datasets.opening import root_of
 from lcf3d.detectors.classes import class_mapping
+from lcf3d.detectors.lidar.config import LidarConfig
+from lcf3d.detectors.lidar.grounding import LEVEL_M, level_points
 from lcf3d.errors import ConfigError, DatasetError
 from lcf3d.geometry.boxes import points_in_boxes
 from lcf3d.geometry.camera import project_points
+from lcf3d.geometry.ground import ground_field
 from lcf3d.structures import KITTI_CLASSES, Detections3D, FloatArray, Frame, IntArray
 from lcf3d.training.samples import ScanSample, read_scan
 
@@ -105,6 +108,19 @@ def dataset_scans(
 
     nuscenes = NuscenesDataset(root, version, split)
     return ScanSource(lambda i: _from_frame(nuscenes[i], class_names), len(nuscenes), math.pi)
+
+
+def levelled_scan(scan: LabelledScan, config: LidarConfig) -> LabelledScan:
+    """The scan as a network of this configuration is shown it: on level ground, if it wants that."""
+    if config.ground != "level":
+        return scan
+    x0, y0, _, x1, y1, _ = config.voxels.area
+    reach = math.hypot(max(-x0, x1), max(-y0, y1))
+    ground = ground_field(scan.points, (-reach, -reach, reach, reach), LEVEL_M)
+    points = level_points(scan.points, ground).astype(np.float32)
+    boxes = scan.boxes.copy()
+    boxes[:, 2] -= ground.heights(boxes) - LEVEL_M
+    return LabelledScan(points, boxes, scan.labels, scan.counts)
 
 
 def labelled_scan(sample: ScanSample, class_names: Sequence[str]) -> LabelledScan:

@@ -24,6 +24,8 @@ boxes, which the fusion's clustering lives on."""
 HEAT_SIGMA = 0.8
 """Standard deviation in cells of an object's heat, for small objects; long ones have a larger one."""
 HEAT_REACH = 3
+FRONT_SLOPE = 4.0
+"""How sharply telling front from rear is judged."""
 FRONT_WEIGHT = 0.5
 """Weight of the heading beside that of its axis, on which the overlap with the object depends."""
 
@@ -115,7 +117,7 @@ def _blank(counted, x, y, half_length, half_width, yaw):  # type: ignore[no-unty
 
 
 def center_losses(maps: Mapping[str, Any], batch: Mapping[str, Any], box_weight: float) -> dict[str, Any]:
-    """Loss terms ``heat``, ``place``, ``size``, ``heading`` and ``axis`` of a centre head's maps.
+    """Loss terms ``heat``, ``place``, ``size``, ``heading``, ``front`` and ``axis`` of a centre head's maps.
 
     Args:
         maps: of one task, (N, C, H, W) each.
@@ -137,10 +139,14 @@ def center_losses(maps: Mapping[str, Any], batch: Mapping[str, Any], box_weight:
     learned = flat.permute(0, 2, 3, 1).reshape(-1, BOX_CHANNELS - 1)[batch["cells"]]
     values, weight = batch["boxes"][:, :-1], batch["boxes"][:, -1:]
     error = (learned - values).abs() * weight * (box_weight / objects)
+    # which of the two headings along the axis: the sign of the projection onto the true one
+    ahead = (learned[:, 6:8] * values[:, 6:8]).sum(dim=1, keepdim=True)
+    front = (torch.nn.functional.softplus(-FRONT_SLOPE * ahead) * weight).sum() * (FRONT_WEIGHT * box_weight / objects)
     return {
         "heat": heat_loss,
         "place": error[:, :3].sum(),
         "size": error[:, 3:6].sum(),
         "heading": error[:, 6:8].sum() * FRONT_WEIGHT,
+        "front": front,
         "axis": error[:, 8:10].sum(),
     }

@@ -89,6 +89,8 @@ class LocalizerTask:
 
     def loss(self, network: Any, batch: dict[str, Any]) -> dict[str, Any]:
         """Weighted terms of `LossWeights`."""
+        device = next(network.parameters()).device
+        batch = {name: value.to(device) for name, value in batch.items()}
         return frustum_losses(network(batch["points"], batch["context"]), batch, self.spec, self.weights)
 
     def validate(self, network: Any) -> dict[str, float]:
@@ -112,16 +114,18 @@ class LocalizerTask:
     ) -> tuple[FloatArray, FloatArray, IntArray, FloatArray]:
         """(F, 7) boxes, (F, 7) true boxes, (F,) labels, (F,) qualities of pooled frustums."""
         torch = import_torch()
+        device = next(network.parameters()).device
         boxes, truth, quality = [], [], []
         for first in range(0, len(frustums), VALIDATION_BATCH):
             rng = np.random.default_rng([seed, first])
             samples = [self._draw(f, how, rng) for f in frustums[first : first + VALIDATION_BATCH]]
             arrays = assemble(samples, self.spec, rng)
+            inputs = (torch.from_numpy(arrays[name]).to(device) for name in ("points", "context"))
             with torch.inference_mode():
-                outputs = network(torch.from_numpy(arrays["points"]), torch.from_numpy(arrays["context"]))
-            centres = arrays["reference"] + outputs.centre.double().numpy()
-            boxes.append(decode_boxes(centres, outputs.box.double().numpy(), self.spec))
-            quality.append(torch.sigmoid(outputs.quality).numpy())
+                outputs = network(*inputs)
+            centres = arrays["reference"] + outputs.centre.double().cpu().numpy()
+            boxes.append(decode_boxes(centres, outputs.box.double().cpu().numpy(), self.spec))
+            quality.append(torch.sigmoid(outputs.quality).cpu().numpy())
             truth.append(np.array([s.box for s in samples]))
         return np.concatenate(boxes), np.concatenate(truth), labels_of(frustums), np.concatenate(quality)
 
@@ -174,15 +178,17 @@ def frustum_losses(outputs: Any, batch: Mapping[str, Any], spec: LocalizerSpec, 
     functional = torch.nn.functional
     from lcf3d.localizers.pointnet import smooth_l1
 
-    real, label, rows = batch["real"], batch["label"], torch.arange(len(batch["label"]))
+    real, label, device = batch["real"], batch["label"], batch["label"].device
+    rows = torch.arange(len(label), device=device)
     share = real / real.sum().clamp(min=1)
-    templates = torch.tensor(spec.templates, dtype=torch.float32)[label]
+    templates = torch.tensor(spec.templates, dtype=torch.float32, device=device)[label]
     _, size_residual, size_score, heading_residual, heading_score = split_outputs(outputs.box, len(spec.class_names))
     wanted_residual = batch["size"] / templates - 1
     own_size = size_residual[rows, label]
     own_heading = heading_residual[rows, batch["heading"]]
     size = templates * (1 + own_size)
-    yaw = torch.tensor(spec.headings, dtype=torch.float32)[batch["heading"]] + own_heading * HEADING_UNIT_RAD
+    headings = torch.tensor(spec.headings, dtype=torch.float32, device=device)
+    yaw = headings[batch["heading"]] + own_heading * HEADING_UNIT_RAD
     corners = corner_distance(outputs.centre, size, yaw, batch["centre"], batch["size"], batch["yaw"])
     entropy = functional.cross_entropy
     terms = {
@@ -204,7 +210,7 @@ def corner_distance(centre: Any, size: Any, yaw: Any, true_centre: Any, true_siz
     torch = import_torch()
 
     def corners(middle: Any, extent: Any, heading: Any) -> Any:
-        signs = torch.tensor([[x, y, z] for x in (1.0, -1.0) for y in (1.0, -1.0) for z in (1.0, -1.0)])
+        signs = middle.new_tensor([[x, y, z] for x in (1.0, -1.0) for y in (1.0, -1.0) for z in (1.0, -1.0)])
         local = signs[None] * extent[:, None] / 2
         cos, sin = heading.cos()[:, None], heading.sin()[:, None]
         turned = [cos * local[..., 0] - sin * local[..., 1], sin * local[..., 0] + cos * local[..., 1], local[..., 2]]
@@ -222,7 +228,8 @@ def corner_distance(centre: Any, size: Any, yaw: Any, true_centre: Any, true_siz
 def _true_quality(outputs: Any, batch: Mapping[str, Any], spec: LocalizerSpec) -> Any:
     """(K,) 3D IoU of the boxes that the network would give now with the true ones; 0 where there is nothing."""
     torch = import_torch()
-    found = decode_boxes(outputs.centre.detach().double().numpy(), outputs.box.detach().double().numpy(), spec)
+    centre, box = (value.detach().double().cpu().numpy() for value in (outputs.centre, outputs.box))
+    found = decode_boxes(centre, box, spec)
     found[:, 3:6] = np.maximum(found[:, 3:6], 0.05)
-    true = torch.cat([batch["centre"], batch["size"], batch["yaw"][:, None]], dim=1).double().numpy()
-    return torch.from_numpy(paired_iou(found, true)).float() * batch["real"]
+    true = torch.cat([batch["centre"], batch["size"], batch["yaw"][:, None]], dim=1).double().cpu().numpy()
+    return torch.from_numpy(paired_iou(found, true)).float().to(batch["real"].device) * batch["real"]

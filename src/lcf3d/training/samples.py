@@ -7,7 +7,7 @@ end at the image's border, while these go all around the car. Equal recipes give
 from __future__ import annotations
 
 import multiprocessing
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures import as_completed as as_they_end
 from dataclasses import asdict, dataclass
@@ -155,18 +155,36 @@ def _count(done: Iterable[int], progress: Callable[[int], None]) -> None:
 
 def _write_one(recipe: SampleRecipe, root: Path, index: int) -> int:
     """Simulate and write one sample."""
+    write_scene_samples({root: recipe}, index)
+    return index
+
+
+def write_scene_samples(recipes: Mapping[Path, SampleRecipe], index: int) -> None:
+    """Simulate one scene and write a sample of each recipe from it, what is there already left alone.
+
+    Args:
+        recipes: by folder; they differ in sensor and image scale only.
+        index: number of the scene and its samples.
+
+    Raises:
+        MissingExtraError: embreex is not installed.
+    """
     from lcf3d.simulation.presets import get_preset
     from lcf3d.simulation.scene import build_scene
 
-    preset = get_preset(recipe.preset)
-    if recipe.scale != 1:
-        preset = preset.resized(recipe.scale)
-    scene = build_scene(np.random.default_rng([recipe.seed, index]), preset.layout, 0.0, None, recipe.density)
-    make = _scan_arrays if recipe.sensor == "lidar" else _image_arrays
-    arrays = make(scene, preset, (recipe.seed, index, 0))
-    with atomic_path(root / f"{index:06d}.npz") as temporary:
-        np.savez(temporary, allow_pickle=False, **arrays)
-    return index
+    first = next(iter(recipes.values()))
+    preset = get_preset(first.preset)
+    rng = np.random.default_rng([first.seed, index])
+    scene = build_scene(rng, preset.layout, 0.0, None, first.density, preset.world)
+    for root, recipe in recipes.items():
+        path = root / f"{index:06d}.npz"
+        if path.is_file():
+            continue
+        sensors = preset if recipe.scale == 1 else preset.resized(recipe.scale)
+        make = _scan_arrays if recipe.sensor == "lidar" else _image_arrays
+        arrays = make(scene, sensors, (recipe.seed, index, 0))
+        with atomic_path(path) as temporary:
+            np.savez(temporary, allow_pickle=False, **arrays)
 
 
 def _scan_arrays(scene: Scene, preset: Preset, seed: tuple[int, ...]) -> dict[str, NDArray[np.generic]]:

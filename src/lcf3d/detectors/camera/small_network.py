@@ -148,7 +148,9 @@ class SmallDetector(nn.Module):
         pyramid = self._pyramid(maps[1:])
         rows, boxes = [], []
         for level, (stride, features) in enumerate(zip(STRIDES, pyramid, strict=True)):
-            raw = self.predict(self.tower(features)).flatten(2).transpose(1, 2)
+            # in full precision also where the convolutions are not: a pixel is a small part of an image
+            with torch.autocast(features.device.type, enabled=False):
+                raw = self.predict(self.tower(features).float()).flatten(2).transpose(1, 2)
             rows.append(raw)
             boxes.append(self._boxes(raw, features, stride, level))
         table = torch.cat(rows, dim=1)
@@ -156,7 +158,7 @@ class SmallDetector(nn.Module):
         prototypes = None
         if self.config.prototypes:
             merged = self.fine(maps[0]) + _twice(self.coarse(pyramid[0]))
-            prototypes = self.prototype(merged)
+            prototypes = self.prototype(merged).float()
         return SmallOutputs(table[..., :classes], torch.cat(boxes, dim=1), table[..., classes + 4 :], prototypes)
 
     def _pyramid(self, maps: Sequence[Tensor]) -> list[Tensor]:

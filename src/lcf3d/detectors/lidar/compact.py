@@ -17,7 +17,7 @@ from lcf3d.detectors.lidar.heads import LightCenterHead
 from lcf3d.detectors.lidar.inputs import Inputs, encoder_inputs
 from lcf3d.detectors.lidar.necks import SecondFPN
 from lcf3d.detectors.lidar.statistics import FEATURES
-from lcf3d.networks.torch import Tensor, nn
+from lcf3d.networks.torch import Tensor, nn, torch
 
 
 class CompactNetwork(nn.Module):
@@ -44,8 +44,10 @@ class CompactNetwork(nn.Module):
             grid: width and height of the maps in pillars, multiples of 8; those of the configuration without it.
         """
         width, height = grid or (self.width, self.height)
-        canvas = scatter_pillars(self.voxel_encoder(features), cells, height, width, scans)
-        if self.training:
+        # in full precision also where the convolutions are not: heights matter to the centimetre
+        with torch.autocast(features.device.type, enabled=False):
+            canvas = scatter_pillars(self.voxel_encoder(features), cells, height, width, scans)
+        if self.training and canvas.device.type == "cpu":
             # gradients of convolutions are quicker with the channels outermost, the convolutions themselves innermost
             canvas = canvas.contiguous()
         maps: Sequence[Any] = self.bbox_head(self.neck(self.backbone(canvas)))

@@ -8,6 +8,7 @@ from typing import Any
 from lcf3d.errors import ConfigError
 
 CHANNELS = ("x", "y", "z", "intensity", "time")
+GROUND_MODES = ("ignored", "rest", "level")
 
 
 @dataclass(frozen=True)
@@ -128,6 +129,8 @@ class LidarConfig:
         offsets_replace_position: see `lcf3d.detectors.lidar.voxelization.decorate`.
         encoding: what the encoder sees of a pillar: its ``points``, or their ``statistics`` (see
             `lcf3d.detectors.lidar.statistics`).
+        ground: what the ground under a scan is used for (`lcf3d.detectors.lidar.grounding`): nothing (``ignored``), to
+            set boxes on it (``rest``), or to level the scan before the network sees it (``level``).
     """
 
     name: str
@@ -142,6 +145,11 @@ class LidarConfig:
     variant: str = ""
     offsets_replace_position: bool = False
     encoding: str = "points"
+    ground: str = "ignored"
+
+    def __post_init__(self) -> None:
+        if self.ground not in GROUND_MODES:
+            raise ConfigError(f"{self.name}: ground takes {', '.join(GROUND_MODES)}, got {self.ground!r}")
 
     @property
     def has_velocity(self) -> bool:

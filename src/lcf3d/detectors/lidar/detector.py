@@ -13,6 +13,7 @@ from typing_extensions import Self
 
 from lcf3d.detectors.lidar.config import LidarConfig
 from lcf3d.detectors.lidar.fusing import fuse_batch_norm
+from lcf3d.detectors.lidar.grounding import ground_of, grounded, levelled
 from lcf3d.detectors.lidar.inputs import Inputs, map_detections, pillar_inputs
 from lcf3d.detectors.lidar.suppression import NmsMode, suppression_threshold
 from lcf3d.errors import ConfigError
@@ -111,14 +112,16 @@ class TorchLidarDetector(ABC):
         Raises:
             ShapeError: too few columns.
         """
-        inputs = self.inputs(points)
+        ground = ground_of(points, self.config)
+        inputs = self.inputs(levelled(points, ground, self.config))
         if inputs is None:
             empty = Detections3D.empty(self.class_names)
             return (
                 Detections3D(**{**vars(empty), "velocities": np.zeros((0, 2))}) if self.config.has_velocity else empty
             )
         with torch.inference_mode():
-            return self.detect({name: torch.from_numpy(value).to(self.device) for name, value in inputs.items()})
+            found = self.detect({name: torch.from_numpy(value).to(self.device) for name, value in inputs.items()})
+        return grounded(found, ground, self.config)
 
     @abstractmethod
     def inputs(self, points: NDArray[np.floating]) -> Inputs | None:

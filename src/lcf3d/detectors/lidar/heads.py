@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from lcf3d.detectors.lidar.backbones import ConvModule
 from lcf3d.detectors.lidar.config import AnchorSpec, CenterSpec
-from lcf3d.networks.torch import Tensor, nn
+from lcf3d.networks.torch import Tensor, nn, torch
 
 AnchorMaps = list[tuple[Tensor, Tensor, Tensor]]
 CENTER_CHANNELS = {"reg": 2, "height": 1, "dim": 3, "rot": 2, "vel": 2}
@@ -116,6 +116,11 @@ class LightCenterHead(nn.Module):
     def forward(self, maps: Sequence[Tensor]) -> list[dict[str, Tensor]]:
         """The maps of every task."""
         shared = self.shared_conv(maps[0])
+        # in full precision also where the convolutions before are not: a hundredth of a metre matters
+        with torch.autocast(shared.device.type, enabled=False):
+            return self._maps(shared.float())
+
+    def _maps(self, shared: Tensor) -> list[dict[str, Tensor]]:
         return [
             dict(zip(names, head(shared).split(list(names.values()), dim=1), strict=True))
             for names, head in zip(self.maps, self.task_heads, strict=True)

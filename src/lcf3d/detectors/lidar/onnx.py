@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lcf3d.detectors.lidar.config import LidarConfig
+from lcf3d.detectors.lidar.grounding import ground_of, grounded, levelled
 from lcf3d.detectors.lidar.inputs import encoder_inputs, map_detections
 from lcf3d.detectors.lidar.suppression import NmsMode, suppression_threshold
 from lcf3d.errors import ConfigError, DetectorError
@@ -61,11 +62,13 @@ class OnnxLidarDetector:
 
     def __call__(self, points: NDArray[np.floating]) -> Detections3D:
         """Detections in (N, 4 or more) points, as of `lcf3d.detectors.lidar.detector.TorchLidarDetector`."""
-        inputs = encoder_inputs(points, self.config)
+        ground = ground_of(points, self.config)
+        inputs = encoder_inputs(levelled(points, ground, self.config), self.config)
         if inputs is None:
             velocities = np.zeros((0, 2)) if self.config.has_velocity else None
             return Detections3D(np.zeros((0, 7)), np.zeros(0), np.zeros(0, np.int64), self.class_names, velocities)
-        return map_detections(self.maps(inputs), self.config, self.score_threshold, self.nms)
+        found = map_detections(self.maps(inputs), self.config, self.score_threshold, self.nms)
+        return grounded(found, ground, self.config)
 
     def maps(self, inputs: dict[str, NDArray[Any]]) -> list[Any]:
         """The head's maps, without batch axis, from the arrays of `encoder_inputs`."""

@@ -206,6 +206,7 @@ COMPACT_KITTI = LidarConfig(
         axis=True,
     ),
     encoding="statistics",
+    ground="level",
 )
 
 PRESETS: dict[str, LidarConfig] = {
