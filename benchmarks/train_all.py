@@ -130,7 +130,7 @@ def _watch(
                     trainings[name] = _start(options, name, 1)
         if time.time() - told > 15:
             told = time.time()
-            counts = {folder: len(list((options.work / folder).glob("*.npz"))) for folder in SEEDS}
+            counts = {folder: len(list((options.work / folder).glob("[!.]*.npz"))) for folder in SEEDS}
             simulating = sum(p.poll() is None for p in running.values())
             say(options, f"{told - plan.begin:.0f} s: {counts}, {simulating} simulate; {_heads(options, trainings)}")
 
@@ -171,7 +171,7 @@ def _gather(options: argparse.Namespace, plan: Plan) -> None:
         path = options.work / f"{name}.json"
         if path.is_file():
             figures[name] = json.loads(path.read_text())
-    figures["samples"] = {folder: len(list((options.work / folder).glob("*.npz"))) for folder in SEEDS}
+    figures["samples"] = {folder: len(list((options.work / folder).glob("[!.]*.npz"))) for folder in SEEDS}
     figures["seconds"] = round(time.time() - plan.begin, 1)
     (options.out / "figures.json").write_text(json.dumps(figures, indent=1))
     with (options.out / "log.txt").open("a") as log:

@@ -61,12 +61,12 @@ class Arrivals:
 
     def held_out(self) -> list[Path]:
         """The held-out samples that are there."""
-        return [p for p in sorted(self.folder.glob("*.npz")) if is_held_out(p)]
+        return [p for p in sorted(self.folder.glob("[!.]*.npz")) if is_held_out(p)]
 
     def _read(self) -> None:
         seen: set[str] = set()
         while True:
-            new = [p for p in sorted(self.folder.glob("*.npz")) if p.name not in seen and not is_held_out(p)]
+            new = [p for p in sorted(self.folder.glob("[!.]*.npz")) if p.name not in seen and not is_held_out(p)]
             for path in new:
                 seen.add(path.name)
                 self._ready.extend(self.prepared([path]))

@@ -148,9 +148,10 @@ class SmallDetector(nn.Module):
         pyramid = self._pyramid(maps[1:])
         rows, boxes = [], []
         for level, (stride, features) in enumerate(zip(STRIDES, pyramid, strict=True)):
+            hidden = self.tower(features)
             # in full precision also where the convolutions are not: a pixel is a small part of an image
             with torch.autocast(features.device.type, enabled=False):
-                raw = self.predict(self.tower(features).float()).flatten(2).transpose(1, 2)
+                raw = self.predict(hidden.float()).flatten(2).transpose(1, 2)
             rows.append(raw)
             boxes.append(self._boxes(raw, features, stride, level))
         table = torch.cat(rows, dim=1)
