@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
-import os
 import pickle
 from dataclasses import replace
 
@@ -50,38 +48,6 @@ def test_weights_in_the_layout_of_spconv_2_are_turned():
     network = detector_class("second").build(config)
     load_published(network, turned, "second")
     assert all(torch.equal(a, b) for a, b in zip(network.state_dict().values(), state.values(), strict=True))
-
-
-@pytest.mark.parametrize("function", [os.mkdir, importlib.import_module])
-def test_no_code_in_the_file_is_executed(tmp_path, monkeypatch, function):
-    (tmp_path / "surprise.py").write_text("raise SystemExit")
-    monkeypatch.syspath_prepend(tmp_path)
-
-    class Payload:
-        def __reduce__(self):
-            return function, ("surprise" if function is importlib.import_module else str(tmp_path / "made"),)
-
-    path = tmp_path / "evil.pth"
-    torch.save({"state_dict": {"weight": torch.ones(2)}, "log": Payload()}, path)
-    if function is os.mkdir:  # torch refuses modules of the operating system outright
-        with pytest.raises(DetectorError, match="cannot be read"):
-            read_state_dict(path)
-    else:
-        assert list(read_state_dict(path)) == ["weight"]
-    assert not (tmp_path / "made").exists()
-
-
-class History:
-    """What training frameworks leave in a checkpoint: an object with a state."""
-
-    def __init__(self):
-        self.values = np.arange(3)
-
-
-def test_training_logs_in_the_file_are_skipped(tmp_path):
-    path = tmp_path / "epoch_80.pth"
-    torch.save({"message_hub": {"loss": History()}, "state_dict": {"module.weight": torch.ones(2)}}, path)
-    assert torch.equal(read_state_dict(path)["weight"], torch.ones(2))
 
 
 def test_a_half_downloaded_file(pointpillars_file, tmp_path):

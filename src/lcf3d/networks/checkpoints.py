@@ -2,33 +2,17 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from lcf3d.errors import DetectorError
+from lcf3d.errors import DetectorError, MissingExtraError
+from lcf3d.networks.inert_pickle import LazyTensor, load_inert
 
 TRAINING_FORMAT = "lcf3d-training-1"
 """What the checkpoints of our own trainings call themselves."""
 SHOWN_NAMES = 5
 """Names listed in a message before it goes on with how many more there are."""
-
-
-class _Inert:
-    """Stands for whatever a checkpoint holds beside tensors: training logs, settings, random states."""
-
-    def __init__(self, *arguments: Any, **settings: Any) -> None: ...
-
-    def __setstate__(self, state: Any) -> None: ...
-
-    def __setitem__(self, key: Any, value: Any) -> None: ...
-
-    def append(self, item: Any) -> None:
-        """Take an item of a pickled list, and forget it."""
-
-    def extend(self, items: Any) -> None:
-        """Take items of a pickled list, and forget them."""
 
 
 def read_state_dict(path: Path) -> dict[str, Any]:
@@ -41,29 +25,23 @@ def read_state_dict(path: Path) -> dict[str, Any]:
         MissingExtraError: torch is not installed.
         DetectorError: no such file, a damaged one, or one without parameters.
     """
-    from lcf3d.networks.torch import torch
-
     if not path.is_file():
         raise DetectorError(f"checkpoint {path} does not exist; lcf3d models get NAME downloads a published one")
     try:
-        content = _load_inert(torch, path)
-    except (OSError, RuntimeError, EOFError, ValueError, KeyError, AttributeError, TypeError, ImportError) as error:
-        reason = str(error).splitlines()[0][:160] if str(error) else type(error).__name__
-        raise _damaged(path, reason) from None
-    except Exception as error:
-        # torch raises pickle.UnpicklingError for globals that it refuses, and struct or zip errors for torn files
-        if type(error).__name__ in {"UnpicklingError", "error", "BadZipFile"}:
-            raise _damaged(path, str(error).splitlines()[0][:160]) from None
+        content = load_inert(path)
+        for key in ("state_dict", "model_state", "model"):
+            if isinstance(content, Mapping) and isinstance(content.get(key), Mapping):
+                content = content[key]
+                break
+        named = content.items() if isinstance(content, Mapping) else ()
+        state = {str(name): value.load() for name, value in named if isinstance(value, LazyTensor)}
+    except MissingExtraError:
         raise
-    for key in ("state_dict", "model_state", "model"):
-        if isinstance(content, Mapping) and isinstance(content.get(key), Mapping):
-            content = content[key]
-            break
-    if not isinstance(content, Mapping):
-        raise DetectorError(f"checkpoint {path} holds no parameters (expected a mapping of names to tensors)")
-    state = {str(name): value for name, value in content.items() if isinstance(value, torch.Tensor)}
+    except Exception as error:
+        # a torn file fails in pickle, zipfile, struct or torch, with errors of unrelated classes
+        raise _damaged(path, str(error).splitlines()[0][:160] if str(error) else type(error).__name__) from None
     if not state:
-        raise DetectorError(f"checkpoint {path} holds no parameters")
+        raise DetectorError(f"checkpoint {path} holds no parameters (expected a mapping of names to tensors)")
     return {name.removeprefix("module."): value for name, value in state.items()}
 
 
@@ -73,21 +51,6 @@ def _damaged(path: Path, reason: str) -> DetectorError:
         f"checkpoint {path} ({size} bytes) cannot be read: damaged, only half downloaded, or not made of plain "
         f"tensors; download it again ({reason})"
     )
-
-
-def _load_inert(torch: Any, path: Path) -> Any:
-    """`torch.load` with ``weights_only``, every class it does not know replaced by `_Inert`."""
-    stand_ins: list[tuple[type, str]] = []
-    while True:
-        try:
-            with torch.serialization.safe_globals(list(stand_ins)):
-                return torch.load(path, map_location="cpu", weights_only=True)
-        except Exception as error:
-            # the message names the class that was refused; anything else is for the caller
-            refused = re.search(r"Unsupported global: GLOBAL ([\w.]+)", str(error))
-            if refused is None or any(name == refused.group(1) for _, name in stand_ins):
-                raise
-            stand_ins.append((type("Inert", (_Inert,), {}), refused.group(1)))
 
 
 def read_training(path: Path) -> dict[str, Any]:
