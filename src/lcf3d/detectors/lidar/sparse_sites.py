@@ -78,8 +78,8 @@ class Sites:
         reached = whole & inside(cells.reshape(-1, 4), shape).reshape(whole.shape)
         offset, inputs = torch.nonzero(reached, as_tuple=True)
         keys, inverse = torch.unique(flat_keys(cells[reached], shape), return_inverse=True)
-        # outputs stand in the order in which the inputs first reach them, as in the original
-        arrival = inputs * len(offsets) + offset
+        # outputs stand in the order in which spconv meets them: offset by offset, of each the inputs in their order
+        arrival = offset * len(self) + inputs
         first = torch.full_like(keys, len(self) * len(offsets)).scatter_reduce(0, inverse, arrival, "amin")
         order = first.argsort()
         rank = torch.empty_like(order)
