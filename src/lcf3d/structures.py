@@ -275,6 +275,21 @@ class Detections2D:
         return replace(selected, labels=labels, class_names=tuple(class_names))
 
 
+@dataclass(frozen=True, eq=False)
+class Sweep:
+    """One LiDAR sweep before the key frame.
+
+    Attributes:
+        points: (N, 4 or more) ``x, y, z, intensity, ...`` in the LiDAR frame at the moment of the sweep.
+        lidar_from_sweep: (4, 4) LiDAR coordinates of the key frame from those of the sweep.
+        time_lag_s: seconds from the sweep to the key frame, positive for the past.
+    """
+
+    points: NDArray[np.floating]
+    lidar_from_sweep: FloatArray
+    time_lag_s: float
+
+
 class Frame:
     """What the sensors saw at one moment; parts that are read from disk are read when first asked for.
 
@@ -288,6 +303,8 @@ class Frame:
         timestamp: moment of the scan in seconds, of any clock that the frames of a drive share; None if unknown.
         world_from_lidar: (4, 4) pose of the LiDAR frame in a frame that does not move; None if unknown.
         sequence: name of the drive that the frame is a moment of; None if it stands alone.
+        sweeps: a function that reads at most so many sweeps before the scan, the latest first; None where there are
+            none (see `Sweep`).
     """
 
     def __init__(
@@ -300,8 +317,11 @@ class Frame:
         timestamp: float | None = None,
         world_from_lidar: FloatArray | None = None,
         sequence: str | None = None,
+        sweeps: Callable[[int], Sequence[Sweep]] | None = None,
     ) -> None:
         self.id = id
+        self._sweeps = sweeps
+        self._sweeps_read: tuple[int, tuple[Sweep, ...]] | None = None
         self.timestamp = timestamp
         self.sequence = sequence
         self.world_from_lidar = (
@@ -323,6 +343,14 @@ class Frame:
         if self._points is not None and (self._points.ndim != 2 or self._points.shape[1] < 4):
             raise ShapeError(f"frame {self.id}: points must have shape (N, 4 or more), got {self._points.shape}")
         return self._points
+
+    def sweeps(self, count: int) -> Sequence[Sweep]:
+        """At most ``count`` LiDAR sweeps before the scan, the latest first; those read last are kept."""
+        if self._sweeps is None or count < 1:
+            return ()
+        if self._sweeps_read is None or self._sweeps_read[0] != count:
+            self._sweeps_read = (count, tuple(self._sweeps(count)))
+        return self._sweeps_read[1]
 
     @property
     def labels(self) -> Detections3D | None:

@@ -104,7 +104,12 @@ def test_what_is_no_tensor_is_a_stand_in(tmp_path, framework):
 @pytest.mark.parametrize("archive", [True, False])
 @pytest.mark.parametrize(
     ("function", "argument"),
-    [(os.mkdir, "made"), (importlib.import_module, "surprise"), (builtins.eval, "open('made', 'w')"), (os.system, "touch made")],
+    [
+        (os.mkdir, "made"),
+        (importlib.import_module, "surprise"),
+        (builtins.eval, "open('made', 'w')"),
+        (os.system, "touch made"),
+    ],
 )
 def test_nothing_in_the_file_is_executed(tmp_path, monkeypatch, function, argument, archive):
     (tmp_path / "surprise.py").write_text("open('made', 'w')")
@@ -136,7 +141,16 @@ def test_a_tensor_that_is_not_even_read_costs_nothing_and_cannot_fail(tmp_path):
         load_inert(path)["optimizer"].load()
 
 
-DTYPES = [torch.float32, torch.float64, torch.float16, torch.bfloat16, torch.int64, torch.int32, torch.uint8, torch.bool]
+DTYPES = [
+    torch.float32,
+    torch.float64,
+    torch.float16,
+    torch.bfloat16,
+    torch.int64,
+    torch.int32,
+    torch.uint8,
+    torch.bool,
+]
 
 
 @settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])

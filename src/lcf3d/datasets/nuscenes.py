@@ -24,6 +24,7 @@ from lcf3d.datasets.nuscenes_annotations import ground_truth_boxes
 from lcf3d.datasets.nuscenes_loading import find_version, load_tables
 from lcf3d.datasets.nuscenes_splits import scenes_of_split
 from lcf3d.datasets.nuscenes_tables import CAMERAS, MAX_CAMERA_DELAY_S, NuscenesTables
+from lcf3d.detectors.lidar.sweeps import accumulate_sweeps
 from lcf3d.errors import ConfigError, DatasetError, FormatError
 from lcf3d.formats.nuscenes import read_submission, write_submission
 from lcf3d.formats.nuscenes_boxes import (
@@ -33,7 +34,7 @@ from lcf3d.formats.nuscenes_boxes import (
     split_by_sample,
 )
 from lcf3d.geometry.rotation import invert_rigid, rigid_transforms
-from lcf3d.structures import NUSCENES_CLASSES, Camera, Detections3D, FloatArray, Frame, IntArray
+from lcf3d.structures import NUSCENES_CLASSES, Camera, Detections3D, FloatArray, Frame, IntArray, Sweep
 
 RAW_FROM_CANONICAL: FloatArray = np.array([[0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]], dtype=np.float64)
 """(4, 4) raw LIDAR_TOP coordinates from canonical ones."""
@@ -41,8 +42,6 @@ RAW_FROM_CANONICAL: FloatArray = np.array([[0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1
 SWEEP_PERIOD_S = 0.05
 """Time between LIDAR_TOP sweeps in seconds."""
 
-EGO_RADIUS_M = 1.0
-"""Returns of earlier sweeps this near the sensor, in x and in y, come from the vehicle itself and are left out."""
 
 
 def read_lidar(path: Path) -> NDArray[np.float32]:
@@ -160,6 +159,7 @@ class NuscenesDataset(BaseDataset):
             timestamp=1e-6 * float(data.timestamps_us[self._lidar_row(token)]),
             world_from_lidar=global_from_lidar,
             sequence=self.tables.scene_names[int(self.tables.samples.scenes[row])],
+            sweeps=lambda count: self.earlier_sweeps(token, count),
         )
 
     def has_image(self, frame_id: str, camera: str) -> bool:
@@ -208,30 +208,35 @@ class NuscenesDataset(BaseDataset):
             DatasetError: no such sample, or its scan is not there.
             FormatError: a scan is cut off.
         """
+        points = read_lidar(self._path(self._lidar_row(token)))
+        return accumulate_sweeps(points, self.earlier_sweeps(token, self.sweeps)) if self.sweeps else points
+
+    def earlier_sweeps(self, token: str, count: int) -> list[Sweep]:
+        """At most ``count`` LIDAR_TOP sweeps before a sample's scan, the latest first, each in its canonical frame.
+
+        Sweeps whose file is absent, or that are older than twice the nominal time of so many, are left out.
+
+        Raises:
+            DatasetError: no such sample.
+            FormatError: a sweep is cut off.
+        """
         row = self._lidar_row(token)
-        points = read_lidar(self._path(row))
-        if not self.sweeps:
-            return points
         data = self.tables.sensor_data
         lidar_from_global = self.lidar_from_global(token)
-        parts = [np.column_stack([points, np.zeros(len(points), np.float32)])]
+        found: list[Sweep] = []
         earlier = row
-        for _ in range(self.sweeps):
+        for _ in range(count):
             earlier = int(data.previous[earlier])
             if earlier < 0:
                 break
             age = 1e-6 * float(data.timestamps_us[row] - data.timestamps_us[earlier])
-            if age > 2 * SWEEP_PERIOD_S * self.sweeps:
+            if age > 2 * SWEEP_PERIOD_S * count:
                 break
             path = self._path(earlier)
-            if not path.is_file():
-                continue
-            sweep = read_lidar(path)
-            sweep = sweep[(np.abs(sweep[:, :2]) >= EGO_RADIUS_M).any(axis=1)]
-            motion = lidar_from_global @ self._global_from_sensor(earlier) @ RAW_FROM_CANONICAL
-            moved = sweep[:, :3].astype(np.float64) @ motion[:3, :3].T + motion[:3, 3]
-            parts.append(np.column_stack([moved, sweep[:, 3], np.full(len(sweep), age)]).astype(np.float32))
-        return np.concatenate(parts)
+            if path.is_file():
+                motion = lidar_from_global @ self._global_from_sensor(earlier) @ RAW_FROM_CANONICAL
+                found.append(Sweep(read_lidar(path), motion, age))
+        return found
 
     def labels(self, token: str) -> Detections3D:
         """Annotations of a sample in its canonical LiDAR frame, with velocities and attributes; scores are 1."""

@@ -6,6 +6,7 @@ Any callable with the right signature is a detector; see ``docs/detectors-camera
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -14,6 +15,25 @@ from numpy.typing import NDArray
 from lcf3d.structures import Detections2D, Detections3D
 
 Image = NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class CloudRequest:
+    """The cloud that a LiDAR detector was trained on and wants to be given; a detector's attribute ``cloud``.
+
+    A detector without that attribute is given the scan as it is.
+
+    Attributes:
+        sweeps: earlier sweeps joined to the scan, which then has the time lag in seconds as fifth column.
+        remove_close: points of an earlier sweep within a metre of the sensor along both x and y are left out.
+        repeat_scan: where no earlier sweep is there, the scan itself takes the place of each, without lag.
+        view: name of the camera whose field of view the cloud is cut to; "" for the whole cloud.
+    """
+
+    sweeps: int = 0
+    remove_close: bool = False
+    repeat_scan: bool = False
+    view: str = ""
 
 
 class CameraDetector(Protocol):
@@ -44,3 +64,9 @@ class LidarDetector(Protocol):
             3D boxes in the LiDAR frame.
         """
         ...
+
+
+def cloud_request(detector: LidarDetector) -> CloudRequest:
+    """What cloud a detector asks for: its attribute ``cloud``, or the plain scan."""
+    request = getattr(detector, "cloud", None)
+    return request if isinstance(request, CloudRequest) else CloudRequest()

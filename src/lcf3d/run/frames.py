@@ -14,6 +14,7 @@ from lcf3d.datasets.base import CameraSource, Dataset, LidarSource
 from lcf3d.errors import DatasetError
 from lcf3d.provenance import FusedDetections, Outcome, Reason
 from lcf3d.run.folder import RunFolder
+from lcf3d.run.sources import LidarOnScans
 from lcf3d.structures import Detections2D, Detections3D, Frame
 
 
@@ -79,6 +80,8 @@ class FrameRunner:
         # a camera that this run was never to use is nothing to report
         unused = tuple(f"camera {camera.name} " for camera in frame.cameras if camera.name not in self.cameras)
         notes = tuple(note for note in fused.notes if not note.startswith(unused))
+        if isinstance(self.lidar, LidarOnScans):
+            notes += self.lidar.notes(frame)
         return replace(summarize(frame_id, fused, spent), notes=notes)
 
     def _with_absent_cameras(self, fused: FusedDetections, frame: Frame) -> FusedDetections:

@@ -6,27 +6,30 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from lcf3d.datasets.base import CameraSource, Dataset, LidarSource
-from lcf3d.detectors.base import CameraDetector, LidarDetector
+from lcf3d.detectors.base import CameraDetector, LidarDetector, cloud_request
+from lcf3d.detectors.lidar.sweeps import cloud_of, missing_of
 from lcf3d.detectors.named import load_detector
 from lcf3d.errors import DatasetError
 from lcf3d.structures import Detections2D, Detections3D, Frame
 
 
 class LidarOnScans:
-    """A LiDAR detector, run on the frames' scans."""
+    """A LiDAR detector, run on the clouds of the frames that it asks for (see `CloudRequest`)."""
 
     def __init__(self, detector: LidarDetector) -> None:
         self.detector = detector
 
     def detect(self, frame: Frame) -> Detections3D:
-        """Run the detector.
+        """Run the detector; its boxes are in the frame's LiDAR coordinates.
 
         Raises:
             DatasetError: the frame has no scan.
         """
-        if frame.points is None:
-            raise DatasetError(f"frame {frame.id} has no scan for the LiDAR detector; pass results:PATH instead")
-        return self.detector(frame.points)
+        return self.detector(cloud_of(frame, cloud_request(self.detector)))
+
+    def notes(self, frame: Frame) -> tuple[str, ...]:
+        """What the frame lacks of the cloud that the detector was trained on."""
+        return missing_of(frame, cloud_request(self.detector))
 
 
 class CameraOnImages:

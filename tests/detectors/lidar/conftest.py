@@ -33,13 +33,18 @@ class Golden:
         """Every parameter and buffer by its published name."""
         import torch
 
-        shapes = json.loads((self.folder / f"{self.name}.shapes.json").read_text())
+        shapes = json.loads((self.folder / f"{self.name.removesuffix('.one_thread')}.shapes.json").read_text())
         return {name: torch.from_numpy(value) for name, value in self.fill.fill_state_dict(shapes).items()}
 
     def points(self, columns: tuple[int, ...] = (0, 1, 2, 3)) -> np.ndarray:
-        """(N, 5) the scan as a user would give it: ``columns`` says where each column of the input goes."""
+        """(N, 5) the scan as a user would give it: ``columns`` says where each column of the input goes.
+
+        The nuScenes models were recorded in the raw LIDAR_TOP frame, x right and y forward; a user's x is forward.
+        """
         points = np.zeros((len(self.arrays["input"]), 5), np.float32)
         points[:, columns] = self.arrays["input"]
+        if "_nus" in self.name:
+            points[:, 0], points[:, 1] = points[:, 1].copy(), -points[:, 0].copy()
         return points
 
     def check(self, stage: str, value: Any, tolerance: float) -> None:
@@ -47,7 +52,11 @@ class Golden:
         expected_shape = self.info["maps"][stage]["shape"]
         assert list(value.shape) == expected_shape, stage
         array = value.detach().cpu().double().numpy().ravel()
-        index, expected = self.arrays[f"map.{stage}.index"], self.arrays[f"map.{stage}.value"].astype(np.float64)
+        keys = [key for key in (f"map.{stage}", f"map.{stage}.nonzero") if f"{key}.index" in self.arrays]
+        index, expected = (
+            np.concatenate([self.arrays[f"{key}.{part}"] for key in keys]) for part in ("index", "value")
+        )
+        expected = expected.astype(np.float64)
         scale = np.maximum(np.abs(expected), self.info["maps"][stage]["std"])
         error = np.abs(array[index] - expected) / scale
         assert error.max() < tolerance, f"{stage}: relative error {error.max():.2e}"
@@ -55,9 +64,14 @@ class Golden:
         np.testing.assert_allclose(np.abs(array).max(), self.info["maps"][stage]["absmax"], rtol=10 * tolerance)
 
     def predictions(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The original's final boxes (bottom centre, with velocities if any), scores and labels."""
+        """The original's final boxes (bottom centre, with velocities if any), scores and labels; x forward."""
         boxes, scores, labels = (self.arrays[f"prediction.{n}_3d"] for n in ("bboxes", "scores", "labels"))
-        return boxes.astype(np.float64), scores.astype(np.float64), labels
+        boxes = boxes.astype(np.float64)
+        if "_nus" in self.name:
+            for x in (0, 7):
+                boxes[:, x], boxes[:, x + 1] = boxes[:, x + 1].copy(), -boxes[:, x].copy()
+            boxes[:, 6] -= np.pi / 2
+        return boxes, scores.astype(np.float64), labels
 
     def check_predictions(self, detections: Any, tolerance: float = 1e-3) -> None:
         """Every final box of the original whose score is not tied is there, and there are as many boxes."""

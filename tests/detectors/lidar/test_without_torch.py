@@ -25,5 +25,5 @@ def test_the_sentence_says_what_to_install():
     result = subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, text=True, check=True)
     shape, reading, network = result.stdout.splitlines()
     assert shape == "(2, 5)"
-    assert reading == "reading a checkpoint needs torch; install it with: pip install 'lcf3d[train]'"
+    assert reading == network
     assert network == "a network in torch needs torch; install it with: pip install 'lcf3d[train]'"

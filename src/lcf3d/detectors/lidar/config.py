@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
+from lcf3d.detectors.base import CloudRequest
 from lcf3d.errors import ConfigError
 
 CHANNELS = ("x", "y", "z", "intensity", "time")
@@ -103,12 +104,15 @@ class Suppression:
         iou_threshold: of two boxes with a higher overlap, the one with the lower score goes.
         candidates: best boxes that enter (of each output map, or of all, see `AnchorSpec.joint`).
         max_boxes: boxes returned at most.
+        over_classes: a box has its best class only, and boxes of all classes suppress one another (OpenPCDet);
+            otherwise it may come out once for each class, and each class is suppressed by itself.
     """
 
     score_threshold: float
     iou_threshold: float
     candidates: int
     max_boxes: int
+    over_classes: bool = False
 
 
 @dataclass(frozen=True)
@@ -131,6 +135,11 @@ class LidarConfig:
             `lcf3d.detectors.lidar.statistics`).
         ground: what the ground under a scan is used for (`lcf3d.detectors.lidar.grounding`): nothing (``ignored``), to
             set boxes on it (``rest``), or to level the scan before the network sees it (``level``).
+        frame: the LiDAR frame it was trained in: ``canonical`` (x forward, y left) or ``lidar_top``, nuScenes' raw
+            frame (x right, y forward). Points are turned into it and boxes back, so that outside of the network
+            everything is canonical.
+        cloud: what it was trained on: earlier sweeps, or the part that a camera sees.
+        tall: points above and below the volume stay among the raw points of a two-stage network (OpenPCDet).
     """
 
     name: str
@@ -146,6 +155,9 @@ class LidarConfig:
     offsets_replace_position: bool = False
     encoding: str = "points"
     ground: str = "ignored"
+    frame: str = "canonical"
+    cloud: CloudRequest = CloudRequest()
+    tall: bool = False
 
     def __post_init__(self) -> None:
         if self.ground not in GROUND_MODES:
@@ -192,6 +204,8 @@ class LidarConfig:
             if values["anchors"] is not None:
                 levels = tuple(AnchorLevel(**level) for level in values["anchors"]["levels"])
                 values["anchors"] = AnchorSpec(**{**values["anchors"], "levels": levels})
+            if "cloud" in values:
+                values["cloud"] = CloudRequest(**values["cloud"])
             return cls(**values)
         except (KeyError, TypeError) as error:
             raise ConfigError(f"not a LiDAR network configuration of lcf3d: {error}") from None

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lcf3d.detectors.lidar.config import AnchorLevel, AnchorSpec, LidarConfig, Suppression
+from lcf3d.detectors.lidar.frames import canonical_boxes
 from lcf3d.detectors.lidar.suppression import NmsMode, bev_nms, suppression_threshold
 from lcf3d.geometry.boxes import canonical_from_mmdet3d
 from lcf3d.structures import BoolArray, Detections3D, FloatArray, IntArray
@@ -140,8 +141,11 @@ def select_by_class(
 ) -> tuple[FloatArray, FloatArray, IntArray]:
     """Boxes, scores and labels after thresholding and suppression, each class on its own.
 
-    A candidate may come out once for each class whose score it passes. Without NMS, as many boxes as candidates.
+    A candidate may come out once for each class whose score it passes; by a rule ``over_classes``, once with its best.
+    Without NMS, as many boxes as candidates.
     """
+    if rule.over_classes:
+        return _select_over_classes(candidates, spec, rule, score_threshold, nms)
     iou_threshold = suppression_threshold(nms, rule.iou_threshold)
     indices, labels = [], []
     for label in range(candidates.scores.shape[1]):
@@ -157,6 +161,20 @@ def select_by_class(
     boxes = candidates.boxes[index[order]]
     boxes[:, 6] = turn_by_direction(boxes[:, 6], candidates.directions[index[order]], spec.direction_offset)
     return boxes, scores[order], label_array[order]
+
+
+def _select_over_classes(
+    candidates: Candidates, spec: AnchorSpec, rule: Suppression, score_threshold: float, nms: NmsMode
+) -> tuple[FloatArray, FloatArray, IntArray]:
+    """Each candidate with its best class; boxes of all classes suppress one another."""
+    scores, labels = candidates.scores.max(axis=1), candidates.scores.argmax(axis=1)
+    passed = np.flatnonzero(scores >= score_threshold)
+    threshold = suppression_threshold(nms, rule.iou_threshold)
+    index = passed[bev_nms(candidates.boxes[passed], scores[passed], threshold)]
+    index = index[: rule.max_boxes if nms == "keep" else max(rule.max_boxes, rule.candidates)]
+    boxes = candidates.boxes[index]
+    boxes[:, 6] = turn_by_direction(boxes[:, 6], candidates.directions[index], spec.direction_offset)
+    return boxes, scores[index], labels[index]
 
 
 def decode_center_maps(
@@ -222,6 +240,7 @@ def _within(boxes: FloatArray, limits: tuple[float, ...]) -> BoolArray:
 
 
 def detections(boxes: FloatArray, scores: FloatArray, labels: IntArray, config: LidarConfig) -> Detections3D:
-    """Canonical detections of bottom-centre boxes (N, 7 or 9)."""
+    """Canonical detections of bottom-centre boxes (N, 7 or 9) in the network's frame."""
+    boxes = canonical_boxes(boxes, config.frame)
     velocities = boxes[:, 7:9] if config.has_velocity else None
     return Detections3D(canonical_from_mmdet3d(boxes), scores, labels, config.class_names, velocities)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import Self
 
+from lcf3d.detectors.base import CloudRequest
 from lcf3d.detectors.lidar.config import LidarConfig
 from lcf3d.detectors.lidar.fusing import fuse_batch_norm
 from lcf3d.detectors.lidar.grounding import ground_of, grounded, levelled
@@ -96,6 +97,11 @@ class TorchLidarDetector(ABC):
 
         state, config = read_lidar_checkpoint(Path(path), preset, cls.architecture)
         return cls.from_state_dict(state, config, **options)
+
+    @property
+    def cloud(self) -> CloudRequest:
+        """The cloud that the network was trained on, see `lcf3d.detectors.lidar.sweeps.cloud_of`."""
+        return self.config.cloud
 
     @property
     def class_names(self) -> tuple[str, ...]:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from lcf3d.detectors.lidar.config import LidarConfig
 from lcf3d.detectors.lidar.decoding import decode_anchor_maps, decode_center_maps, detections, select_by_class
+from lcf3d.detectors.lidar.frames import turned_points
 from lcf3d.detectors.lidar.statistics import pillar_statistics
 from lcf3d.detectors.lidar.suppression import NmsMode
 from lcf3d.detectors.lidar.voxelization import Voxels, decorate, in_area, select_channels, voxelize
@@ -19,8 +20,9 @@ Inputs = dict[str, NDArray[Any]]
 
 
 def network_points(points: NDArray[np.floating], config: LidarConfig) -> NDArray[np.float32]:
-    """(M, C) the points a network sees: its channels, inside its range, finite."""
-    return in_area(select_channels(points, config.channels), config.voxels.area)
+    """(M, C) the points a network sees: its channels, in its own frame, inside its range, finite."""
+    selected = turned_points(select_channels(points, config.channels), config.frame)
+    return in_area(selected, config.voxels.area, config.tall)
 
 
 def pillar_inputs(points: NDArray[np.floating], config: LidarConfig) -> Inputs | None:

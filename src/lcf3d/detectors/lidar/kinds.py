@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lcf3d.detectors.base import LidarDetector
+from lcf3d.detectors.base import CloudRequest, LidarDetector, cloud_request
 from lcf3d.detectors.classes import class_mapping
 from lcf3d.detectors.lidar.suppression import NmsMode
 from lcf3d.errors import DetectorError
@@ -26,6 +26,11 @@ class InClasses:
 
     detector: LidarDetector
     class_names: tuple[str, ...]
+
+    @property
+    def cloud(self) -> CloudRequest:
+        """The cloud that the detector asks for."""
+        return cloud_request(self.detector)
 
     def __call__(self, points: NDArray[np.float32]) -> Detections3D:
         """Detections of (N, 4 or more) points."""

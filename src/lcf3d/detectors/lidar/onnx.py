@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lcf3d.detectors.base import CloudRequest
 from lcf3d.detectors.lidar.config import LidarConfig
 from lcf3d.detectors.lidar.grounding import ground_of, grounded, levelled
 from lcf3d.detectors.lidar.inputs import encoder_inputs, map_detections
@@ -54,6 +55,11 @@ class OnnxLidarDetector:
         self.config = config if candidates is None else config.with_candidates(candidates)
         self.nms = nms
         self.score_threshold = self.config.suppression.score_threshold if score_threshold is None else score_threshold
+
+    @property
+    def cloud(self) -> CloudRequest:
+        """The cloud that the network was trained on, see `lcf3d.detectors.lidar.sweeps.cloud_of`."""
+        return self.config.cloud
 
     @property
     def class_names(self) -> tuple[str, ...]:

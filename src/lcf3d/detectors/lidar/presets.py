@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+from lcf3d.detectors.base import CloudRequest
 from lcf3d.detectors.lidar.config import AnchorLevel, AnchorSpec, CenterSpec, LidarConfig, Suppression, VoxelSpec
 
 _KITTI_CLASSES = ("Pedestrian", "Cyclist", "Car")
@@ -14,6 +15,12 @@ _KITTI_VOXELS = VoxelSpec((0.05, 0.05, 0.1), (0.0, -40.0, -3.0, 70.4, 40.0, 1.0)
 _KITTI_SUPPRESSION = Suppression(0.1, 0.01, 100, 50)
 _KITTI_ANCHORS = AnchorSpec((_KITTI_LEVEL,), (0.0, -40.0, 70.4, 40.0), aligned=False, direction_offset=-math.pi / 2)
 _KITTI_PROPOSALS = Suppression(0.0, 0.7, 1024, 100)
+# both frameworks train on the part of the scan in the left colour camera's image
+_KITTI_CLOUD = CloudRequest(view="left")
+# the OpenMMLab nuScenes pipelines: of the anchor-based networks every point of ten sweeps; of CenterPoint nine sweeps
+# without the vehicle's own points, and the scan itself in the place of sweeps that are not there
+_NUSCENES_CLOUD = CloudRequest(sweeps=10)
+_CENTERPOINT_CLOUD = CloudRequest(sweeps=9, remove_close=True, repeat_scan=True)
 # the OpenMMLab nuScenes pipeline of the anchor-based networks drops the intensity and keeps the time lag
 _NUSCENES_CHANNELS = ("x", "y", "z", "time")
 _NUSCENES_SUPPRESSION = Suppression(0.05, 0.2, 1000, 500)
@@ -38,6 +45,7 @@ POINTPILLARS_KITTI = LidarConfig(
     anchors=AnchorSpec((_KITTI_LEVEL,), (0.0, -39.68, 69.12, 39.68), aligned=True, direction_offset=-math.pi / 2),
     variant="secfpn",
     offsets_replace_position=True,
+    cloud=_KITTI_CLOUD,
 )
 
 _FPN_SIZES = ((2.5981, 0.8660, 1.0), (1.7321, 0.5774, 1.0), (1.0, 1.0, 1.0), (0.4, 0.4, 1.0))
@@ -67,6 +75,8 @@ POINTPILLARS_NUSCENES = LidarConfig(
         code_size=9,
     ),
     variant="fpn",
+    frame="lidar_top",
+    cloud=_NUSCENES_CLOUD,
 )
 
 # class, (length, width, height), z of the bottom face: shape-aware groups of SSN (section 3.2 of its paper)
@@ -104,6 +114,8 @@ SSN_NUSCENES = LidarConfig(
         joint=True,
     ),
     variant="secfpn",
+    frame="lidar_top",
+    cloud=_NUSCENES_CLOUD,
 )
 SSN_REGNET_NUSCENES = replace(SSN_NUSCENES, name="ssn-regnet-nuscenes", variant="regnet")
 
@@ -125,6 +137,8 @@ CENTERPOINT_PILLAR_NUSCENES = LidarConfig(
     suppression=Suppression(0.1, 0.2, 1000, 498),
     centers=CenterSpec(_CENTER_TASKS, stride=4),
     variant="pillar",
+    frame="lidar_top",
+    cloud=_CENTERPOINT_CLOUD,
 )
 CENTERPOINT_VOXEL_NUSCENES = replace(
     CENTERPOINT_PILLAR_NUSCENES,
@@ -142,6 +156,7 @@ SECOND_KITTI = LidarConfig(
     voxels=_KITTI_VOXELS,
     suppression=_KITTI_SUPPRESSION,
     anchors=_KITTI_ANCHORS,
+    cloud=_KITTI_CLOUD,
 )
 PART_A2_KITTI = replace(
     SECOND_KITTI,
@@ -173,11 +188,15 @@ def car_only(config: LidarConfig) -> LidarConfig:
 
 
 def openpcdet(config: LidarConfig) -> LidarConfig:
-    """The form of OpenPCDet 0.6 of a KITTI configuration: other class order, anchors on the border, raw positions."""
+    """The form of OpenPCDet 0.6 of a KITTI configuration.
+
+    Another class order, anchors on the border, raw positions; one class a box, and suppression over all classes; the
+    raw points of PV-RCNN are cut along x and y only.
+    """
     assert config.anchors is not None
     order = (2, 0, 1)
     level = AnchorLevel(tuple(_KITTI_LEVEL.sizes[i] for i in order), tuple(_KITTI_LEVEL.bottoms[i] for i in order))
-    rule = config.suppression if config.proposals else Suppression(0.1, 0.01, 4096, 500)
+    rule = config.suppression if config.proposals else Suppression(0.1, 0.01, 4096, 500, over_classes=True)
     return replace(
         config,
         name=f"{config.name}-openpcdet",
@@ -185,6 +204,7 @@ def openpcdet(config: LidarConfig) -> LidarConfig:
         anchors=replace(config.anchors, levels=(level,), aligned=False, direction_offset=0.78539),
         suppression=rule,
         offsets_replace_position=False,
+        tall=config.proposals is not None,
     )
 
 

@@ -74,11 +74,14 @@ def select_channels(points: NDArray[np.floating], channels: tuple[str, ...]) -> 
     return selected
 
 
-def in_area(points: NDArray[np.float32], area: tuple[float, ...]) -> NDArray[np.float32]:
-    """Those of the (N, 3 or more) points whose values are finite and that lie strictly inside the (6,) volume."""
+def in_area(points: NDArray[np.float32], area: tuple[float, ...], tall: bool = False) -> NDArray[np.float32]:
+    """Those of the (N, 3 or more) points whose values are finite and that lie strictly inside the (6,) volume.
+
+    With ``tall``, the volume has no floor and no ceiling.
+    """
     low, high = np.array(area[:3], np.float32), np.array(area[3:], np.float32)
     inside = np.isfinite(points).all(axis=1)
-    for axis in range(3):
+    for axis in range(2 if tall else 3):
         inside &= (points[:, axis] > low[axis]) & (points[:, axis] < high[axis])
     return points[inside]
 
