@@ -36,6 +36,10 @@ class CloudRequest:
     view: str = ""
 
 
+SCAN = CloudRequest()
+"""The scan as it is."""
+
+
 class CameraDetector(Protocol):
     """The camera branch of the cascade (paper section 4.1.1): images in, 2D detections out."""
 
@@ -69,4 +73,4 @@ class LidarDetector(Protocol):
 def cloud_request(detector: LidarDetector) -> CloudRequest:
     """What cloud a detector asks for: its attribute ``cloud``, or the plain scan."""
     request = getattr(detector, "cloud", None)
-    return request if isinstance(request, CloudRequest) else CloudRequest()
+    return request if isinstance(request, CloudRequest) else SCAN

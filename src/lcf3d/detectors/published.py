@@ -1,42 +1,53 @@
-"""The published weights of the paper's LiDAR detectors: where they are, and fetching them whole and verified.
+"""Published weights: the paper's detectors and localizers, and a camera detector to start with. What, where, whose.
 
-Facts of the model index of mmdetection3d 1.4.0. Its files carry the first eight digits of their SHA-256 in their name;
-the full sums are not published, so those digits are what a download is checked against.
+Facts of the model indices of mmdetection3d 1.4.0 and of the YOLOX releases. OpenMMLab's files carry the first eight
+digits of their SHA-256 in their name; the full sums are not published, so those digits are what a download is checked
+against.
 """
 
 from __future__ import annotations
 
-import hashlib
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from urllib.error import HTTPError, URLError
+from typing import Literal
 from urllib.parse import urlparse
-from urllib.request import urlopen
 
 from lcf3d.errors import DetectorError
-from lcf3d.files import atomic_path
+
+Sensor = Literal["lidar", "camera", "localizer"]
 
 _ROOT = "https://download.openmmlab.com/mmdetection3d/"
-CACHE = Path("~/.cache/lcf3d/models")
-BLOCK = 1 << 20
+_YOLOX = "https://github.com/Megvii-BaseDetection/YOLOX/releases/download/0.1.1rc0/"
 
 
 @dataclass(frozen=True)
 class PublishedModel:
-    """A checkpoint that can be downloaded.
+    """A model that others have published, or that the paper names.
 
     Attributes:
-        name: what it is called here, and the configuration it belongs to.
-        url: where it is; its file name ends in the first digits of its SHA-256.
+        name: what it is called here; of a LiDAR network, the configuration it belongs to.
+        url: where it is; "" where no address is known.
         row: which row of which table of the paper it belongs to; "" for none.
         scores: what its publishers report.
+        sensor: which branch it serves.
+        use: how a command names it.
+        licence: of the published file.
+        sha256: the whole sum where it is known, else "".
+        size_bytes: size of the file where it is known, else 0.
+        note: what to know beyond that.
     """
 
     name: str
     url: str
-    row: str
-    scores: str
+    row: str = ""
+    scores: str = ""
+    sensor: Sensor = "lidar"
+    use: str = ""
+    licence: str = ""
+    sha256: str = ""
+    size_bytes: int = 0
+    note: str = ""
 
     @property
     def file_name(self) -> str:
@@ -45,13 +56,48 @@ class PublishedModel:
 
     @property
     def digest_prefix(self) -> str:
-        """First digits of the SHA-256, from the file name; "" when it has none."""
+        """The SHA-256, or its first digits from the file name; "" when nothing is known."""
         found = re.search(r"[-_]([0-9a-f]{8,64})\.pth$", self.file_name)
-        return found.group(1) if found else ""
+        return self.sha256 or (found.group(1) if found else "")
 
 
 def _model(name: str, path: str, row: str, scores: str) -> PublishedModel:
-    return PublishedModel(name, _ROOT + path, row, scores)
+    kind = next(k for k in ("pointpillars", "second", "part-a2", "pv-rcnn", "ssn", "centerpoint") if name.startswith(k))
+    data = "nuScenes" if "nuscenes" in name else "KITTI"
+    licence = f"Apache-2.0; trained on {data}, which is for non-commercial use"
+    return PublishedModel(name, _ROOT + path, row, scores, use=f"--lidar {kind}:{name}", licence=licence)
+
+
+def _yolox(size: str, scores: str, sha256: str = "", size_bytes: int = 0) -> PublishedModel:
+    note = "COCO's 80 classes; the size and the sum are not published, the file is taken as it comes"
+    return PublishedModel(
+        f"yolox-{size}",
+        f"{_YOLOX}yolox_{size}.onnx",
+        "",
+        scores,
+        "camera",
+        f"--camera yolox:{size}",
+        "Apache-2.0",
+        sha256,
+        size_bytes,
+        "COCO's 80 classes" if sha256 else note,
+    )
+
+
+def _mask_rcnn(name: str, path: str, scores: str) -> PublishedModel:
+    return PublishedModel(
+        name,
+        f"{_ROOT}v0.1.0_models/nuimages_semseg/{path}",
+        "",
+        scores,
+        "camera",
+        f"--camera fasterrcnn:{name}",
+        "Apache-2.0; trained on nuImages, which is for non-commercial use",
+        note="nuScenes' ten classes, with masks",
+    )
+
+
+_AUTHORS = "trained by the LCF3D authors; no public address is known here: pass the path of your file"
 
 
 PUBLISHED: tuple[PublishedModel, ...] = (
@@ -139,6 +185,62 @@ PUBLISHED: tuple[PublishedModel, ...] = (
         "nuScenes: CenterPoint (by its scores)",
         "nuScenes mAP 56.11, NDS 64.61",
     ),
+    _yolox("nano", "COCO AP 25.8", "c789161ed43c8269fcd4e67c67eeeb4e80c622da2eb296a20bc6007bd18a0b7d", 3_659_407),
+    _yolox("tiny", "COCO AP 32.8", "427cc366d34e27ff7a03e2899b5e3671425c262ea2291f88bb942bc1cc70b0f7", 20_219_662),
+    _yolox("s", "COCO AP 40.5", "c5c2d13e59ae883e6af3b45daea64af4833a4951c92d116ec270d9ddbe998063", 35_858_002),
+    _yolox("m", "COCO AP 47.2"),
+    _yolox("l", "COCO AP 50.1", "7860ae79de6c89a3c1eb72ae9a2756c0ccfbe04b7791bb5880afabd97855a411", 216_746_733),
+    _yolox("x", "COCO AP 51.5", "c892d7aaf1c4746d8a4d675bec669a4db4f434b4ee1efb654bc9b353379c7c55", 396_142_663),
+    _mask_rcnn(
+        "mask-rcnn-r50-nuimages",
+        "mask_rcnn_r50_fpn_coco-2x_1x_nuim/mask_rcnn_r50_fpn_coco-2x_1x_nuim_20201008_195238-b1742a60.pth",
+        "nuImages box AP 49.7, mask AP 40.5",
+    ),
+    _mask_rcnn(
+        "mask-rcnn-r50-caffe-nuimages",
+        "mask_rcnn_r50_caffe_fpn_coco-3x_20e_nuim/mask_rcnn_r50_caffe_fpn_coco-3x_20e_nuim_20201009_125002-5529442c.pth",
+        "nuImages box AP 50.6, mask AP 41.3",
+    ),
+    PublishedModel(
+        "fasterrcnn-r101-kitti",
+        "",
+        "KITTI: Faster R-CNN",
+        sensor="camera",
+        use="--camera fasterrcnn:FILE",
+        note=_AUTHORS,
+    ),
+    PublishedModel(
+        "fasterrcnn-r50-nuscenes",
+        "",
+        "nuScenes: Faster R-CNN",
+        sensor="camera",
+        use="--camera fasterrcnn:FILE",
+        note=_AUTHORS,
+    ),
+    PublishedModel(
+        "ddq-detr-nuscenes",
+        "",
+        "nuScenes: DDQ-DETR",
+        sensor="camera",
+        use="--camera mmdet:CONFIG,FILE",
+        note=_AUTHORS,
+    ),
+    PublishedModel(
+        "frustum-pointnet-kitti",
+        "",
+        "KITTI: the localizer",
+        sensor="localizer",
+        use="--localizer frustum-pointnet:FILE",
+        note=_AUTHORS,
+    ),
+    PublishedModel(
+        "frustum-pointnet-nuscenes",
+        "",
+        "nuScenes: the localizer",
+        sensor="localizer",
+        use="--localizer frustum-pointnet:FILE",
+        note=_AUTHORS,
+    ),
 )
 
 
@@ -152,64 +254,3 @@ def find_model(name: str) -> PublishedModel:
         if model.name == name:
             return model
     raise DetectorError(f"no published model {name!r}; known: {', '.join(model.name for model in PUBLISHED)}")
-
-
-def download(model: PublishedModel, folder: Path | None = None, timeout_s: float = 30.0) -> Path:
-    """The path of the model's file in ``folder``, downloaded unless it is there and right.
-
-    Raises:
-        DetectorError: the server cannot be reached or sends something else; nothing is left in ``folder`` then.
-    """
-    path = (folder or CACHE.expanduser()) / model.file_name
-    if path.is_file() and _is_right(model, _sha256(path)):
-        return path
-    with atomic_path(path) as temporary:
-        digest = _fetch(model, temporary, timeout_s)
-        if not _is_right(model, digest):
-            raise DetectorError(
-                f"{model.url} has SHA-256 {digest[:16]}..., expected one that begins with {model.digest_prefix}: "
-                "the download was cut or the file was replaced; try again"
-            )
-    return path
-
-
-def _is_right(model: PublishedModel, digest: str) -> bool:
-    return digest.startswith(model.digest_prefix)
-
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as file:
-        digest = hashlib.sha256()
-        while block := file.read(BLOCK):
-            digest.update(block)
-    return digest.hexdigest()
-
-
-def _fetch(model: PublishedModel, path: Path, timeout_s: float) -> str:
-    """Write what the URL serves to ``path``; its SHA-256."""
-    from rich.progress import BarColumn, DownloadColumn, Progress, TransferSpeedColumn
-
-    digest = hashlib.sha256()
-    received = 0
-    try:
-        with (
-            urlopen(model.url, timeout=timeout_s) as response,
-            path.open("wb") as file,
-            Progress("{task.description}", BarColumn(), DownloadColumn(), TransferSpeedColumn()) as progress,
-        ):
-            length = response.headers.get("Content-Length")
-            task = progress.add_task(model.name, total=int(length) if length else None)
-            while block := response.read(BLOCK):
-                file.write(block)
-                digest.update(block)
-                received += len(block)
-                progress.update(task, completed=received)
-    except (URLError, OSError) as error:
-        reason = error if isinstance(error, HTTPError) else getattr(error, "reason", error)
-        raise DetectorError(
-            f"{model.name} cannot be downloaded from {model.url} ({reason}); on a machine without network, download it "
-            f"elsewhere and put it at {CACHE / model.file_name} or name its path"
-        ) from None
-    if length and received != int(length):
-        raise DetectorError(f"{model.url} sent {received} of {length} bytes; try again")
-    return digest.hexdigest()

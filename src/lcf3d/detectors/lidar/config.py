@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
-from lcf3d.detectors.base import CloudRequest
+from lcf3d.detectors.base import SCAN, CloudRequest
 from lcf3d.errors import ConfigError
 
 CHANNELS = ("x", "y", "z", "intensity", "time")
@@ -156,7 +156,7 @@ class LidarConfig:
     encoding: str = "points"
     ground: str = "ignored"
     frame: str = "canonical"
-    cloud: CloudRequest = CloudRequest()
+    cloud: CloudRequest = SCAN
     tall: bool = False
 
     def __post_init__(self) -> None:

@@ -32,9 +32,12 @@ class TorchLidarDetector(ABC):
         score_threshold: boxes need a higher score; the configuration's own without one.
         device: a torch device, for example ``cpu`` or ``cuda``.
         candidates: best boxes considered before suppression; the configuration's own number without it.
+        first_stage_nms: the same as ``nms`` for the proposals of a two-stage network. ``keep`` without it; the LCF3D
+            authors raise the first stage's overlap with the last one's, which is ``off`` where ``nms`` is.
 
     Raises:
-        ConfigError: ``nms``, ``score_threshold`` or ``candidates`` makes no sense, or there is no such device.
+        ConfigError: ``nms``, ``first_stage_nms``, ``score_threshold`` or ``candidates`` makes no sense, or there is no
+            such device.
     """
 
     architecture: ClassVar[str]
@@ -47,12 +50,17 @@ class TorchLidarDetector(ABC):
         score_threshold: float | None = None,
         device: str = "cpu",
         candidates: int | None = None,
+        first_stage_nms: NmsMode = "keep",
     ) -> None:
         suppression_threshold(nms, 0.0)
+        suppression_threshold(first_stage_nms, 0.0)
+        if first_stage_nms != "keep" and config.proposals is None:
+            raise ConfigError(f"{config.name} has one stage; leave first_stage_nms={first_stage_nms} out, or set nms")
         if score_threshold is not None and not 0 <= score_threshold < 1:
             raise ConfigError(f"score_threshold must be in [0, 1), got {score_threshold}")
         self.config = config if candidates is None else config.with_candidates(candidates)
         self.nms = nms
+        self.first_stage_nms = first_stage_nms
         self.score_threshold = config.suppression.score_threshold if score_threshold is None else score_threshold
         self.device = torch_device(device)
         self.network = channels_innermost(network.eval().requires_grad_(False).to(self.device))

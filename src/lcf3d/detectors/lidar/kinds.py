@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from lcf3d.detectors.base import CloudRequest, LidarDetector, cloud_request
 from lcf3d.detectors.classes import class_mapping
+from lcf3d.detectors.downloads import is_published, local_path
 from lcf3d.detectors.lidar.suppression import NmsMode
 from lcf3d.errors import DetectorError
 from lcf3d.structures import Detections3D
@@ -46,27 +47,39 @@ def load(
     device: str = "cpu",
     preset: str | None = None,
     candidates: int | None = None,
+    first_stage_nms: NmsMode = "keep",
     architecture: str | None = None,
 ) -> LidarDetector:
     """A LiDAR detector from a checkpoint of any of the known architectures.
 
     Args:
-        path: checkpoint file.
+        path: checkpoint file, or the name of a published one (`lcf3d.detectors.published`), downloaded at first use.
         class_names: classes of the detections; the network's own without it.
         nms: ``off`` as in the paper, ``low`` or ``keep``.
         score_threshold: boxes need a higher score; the network's own without it.
         device: torch device.
         preset: name of the configuration; found from the parameters without it.
         candidates: best boxes considered before suppression; the network's own number without it.
+        first_stage_nms: ``keep``, ``low`` or ``off`` for the proposals of Part-A2 and PV-RCNN.
         architecture: what the network must be, if anything.
 
     Raises:
         DetectorError: the file cannot be read, or holds another network.
     """
-    from lcf3d.detectors.lidar.loading import detector_class, read_lidar_checkpoint
+    from lcf3d.detectors.lidar.loading import detector_class, read_lidar_checkpoint, require_architecture
 
-    state, config = read_lidar_checkpoint(Path(path), preset, architecture)
-    options = {"nms": nms, "score_threshold": score_threshold, "device": device, "candidates": candidates}
+    if preset is None and is_published(path, "lidar"):
+        preset = path
+    # before a file of another network is downloaded
+    require_architecture(preset, architecture)
+    state, config = read_lidar_checkpoint(local_path(path, "lidar"), preset, architecture)
+    options = {
+        "nms": nms,
+        "score_threshold": score_threshold,
+        "device": device,
+        "candidates": candidates,
+        "first_stage_nms": first_stage_nms,
+    }
     detector: LidarDetector = detector_class(config.architecture).from_state_dict(state, config, **options)
     return detector if class_names is None else InClasses(detector, tuple(class_names))
 

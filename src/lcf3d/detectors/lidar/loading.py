@@ -105,10 +105,20 @@ def read_lidar_checkpoint(
     Raises:
         DetectorError: the file cannot be read, or fits no configuration, or another architecture.
     """
-    if preset is not None and preset not in PRESETS:
-        raise DetectorError(f"unknown preset {preset!r}; known: {', '.join(PRESETS)}")
+    require_architecture(preset, architecture)
     state = read_state_dict(path)
-    config = PRESETS[preset] if preset is not None else find_config(state, architecture)
-    if architecture is not None and config.architecture != architecture:
-        raise DetectorError(f"preset {config.name} is a {config.architecture} network, not {architecture}")
-    return state, config
+    return state, PRESETS[preset] if preset is not None else find_config(state, architecture)
+
+
+def require_architecture(preset: str | None, architecture: str | None) -> None:
+    """See that a preset, if one is named, is known and of an architecture, if one is wanted.
+
+    Raises:
+        DetectorError: it is not.
+    """
+    if preset is None:
+        return
+    if preset not in PRESETS:
+        raise DetectorError(f"unknown preset {preset!r}; known: {', '.join(PRESETS)}")
+    if architecture is not None and PRESETS[preset].architecture != architecture:
+        raise DetectorError(f"{preset} is a {PRESETS[preset].architecture} network, not {architecture}")

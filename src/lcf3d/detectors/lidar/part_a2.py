@@ -167,7 +167,7 @@ class PartA2(TorchLidarDetector):
         network = self.network
         bev, features = network.middle_encoder(inputs["features"], inputs["coordinates"])
         maps = network.rpn_head(network.neck(network.backbone(bev)))
-        return self.refine(features, inputs["centers"], propose(to_arrays(maps), self.config))
+        return self.refine(features, inputs["centers"], propose(to_arrays(maps), self.config, self.first_stage_nms))
 
     def refine(self, features: Tensor, centers: Tensor, proposals: Proposals) -> Detections3D:
         """The second stage; scores are the sigmoid of the original's raw score."""

@@ -165,7 +165,7 @@ class PVRCNN(TorchLidarDetector):
         stages = network.middle_encoder.stages(inputs["features"], inputs["coordinates"])
         bev = network.middle_encoder.flatten(stages[-1])
         maps = network.rpn_head(network.neck(network.backbone(bev)))
-        proposals = propose(to_arrays(maps), self.config)
+        proposals = propose(to_arrays(maps), self.config, self.first_stage_nms)
         if not len(proposals.boxes):
             return Detections3D.empty(self.class_names)
         return self.refine(network.points_encoder(inputs["points"], stages, bev), proposals)

@@ -13,7 +13,7 @@ import numpy as np
 
 from lcf3d.detectors.lidar.config import LidarConfig
 from lcf3d.detectors.lidar.decoding import Map, decode_anchor_maps, decode_residuals, turn_by_direction
-from lcf3d.detectors.lidar.suppression import bev_nms
+from lcf3d.detectors.lidar.suppression import NmsMode, bev_nms, suppression_threshold
 from lcf3d.networks.torch import Tensor, nn, torch
 from lcf3d.structures import FloatArray, IntArray
 
@@ -33,7 +33,7 @@ class Proposals:
     scores: FloatArray
 
 
-def propose(maps: Sequence[tuple[Map, Map, Map]], config: LidarConfig) -> Proposals:
+def propose(maps: Sequence[tuple[Map, Map, Map]], config: LidarConfig, nms: NmsMode = "keep") -> Proposals:
     """The best anchors of the first stage after suppression over all classes together."""
     spec, rule = config.anchors, config.proposals
     assert spec is not None
@@ -41,7 +41,9 @@ def propose(maps: Sequence[tuple[Map, Map, Map]], config: LidarConfig) -> Propos
     candidates = decode_anchor_maps(maps, spec, len(config.class_names), rule.candidates)
     best = candidates.scores.max(axis=1)
     passed = np.flatnonzero((best > rule.score_threshold) & np.isfinite(candidates.boxes).all(axis=1))
-    kept = passed[bev_nms(candidates.boxes[passed], best[passed], rule.iou_threshold)][: rule.max_boxes]
+    kept = passed[bev_nms(candidates.boxes[passed], best[passed], suppression_threshold(nms, rule.iou_threshold))][
+        : rule.max_boxes
+    ]
     boxes = candidates.boxes[kept]
     boxes[:, 6] = turn_by_direction(boxes[:, 6], candidates.directions[kept], spec.direction_offset)
     return Proposals(boxes, candidates.scores[kept].argmax(axis=1), candidates.scores[kept])
