@@ -156,9 +156,7 @@ def test_a_lidar_detector_is_named_by_its_published_file(tmp_path, monkeypatch):
     # the server is gone: the file is not fetched again
     assert pointpillars("pointpillars-kitti").class_names == ("Pedestrian", "Cyclist", "Car")
     (tmp_path / "cache" / name).unlink()
-    with pytest.raises(
-        DetectorError, match=r"pointpillars-kitti cannot be downloaded .* put it at .*cache.* or"
-    ):
+    with pytest.raises(DetectorError, match=r"pointpillars-kitti cannot be downloaded .* put it at .*cache.* or"):
         pointpillars("pointpillars-kitti")
 
 
@@ -178,9 +176,7 @@ def test_yolox_by_size(tmp_path, monkeypatch, cli):
         raise OSError("no network")
 
     monkeypatch.setattr(downloads, "urlopen", offline)
-    with pytest.raises(
-        DetectorError, match=r"yolox-nano cannot be downloaded .*no network.*yolox_nano.onnx"
-    ):
+    with pytest.raises(DetectorError, match=r"yolox-nano cannot be downloaded .*no network.*yolox_nano.onnx"):
         yolox("nano")
 
 

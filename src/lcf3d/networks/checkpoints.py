@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from lcf3d.errors import DetectorError, MissingExtraError
-from lcf3d.networks.inert_pickle import LazyTensor, load_inert
+from lcf3d.networks.inert_pickle import Inert, LazyTensor, load_inert
 
 TRAINING_FORMAT = "lcf3d-training-1"
 """What the checkpoints of our own trainings call themselves."""
@@ -43,6 +43,33 @@ def read_state_dict(path: Path) -> dict[str, Any]:
     if not state:
         raise DetectorError(f"checkpoint {path} holds no parameters (expected a mapping of names to tensors)")
     return {name.removeprefix("module."): value for name, value in state.items()}
+
+
+def read_notes(path: Path) -> tuple[str, tuple[str, ...]]:
+    """What OpenMMLab's frameworks leave beside the parameters: the configuration's text, and the class names.
+
+    Either is empty where the file tells none.
+
+    Raises:
+        DetectorError: the file cannot be read.
+    """
+    try:
+        content = load_inert(path)
+    except Exception as error:
+        raise _damaged(path, type(error).__name__) from None
+    meta = content.get("meta") if isinstance(content, Mapping) else None
+    if not isinstance(meta, Mapping):
+        return "", ()
+    found = [meta.get("cfg"), meta.get("config")]
+    for value in tuple(found):
+        # a pickled Config holds its text among other things
+        state = value.state if isinstance(value, Inert) else ()
+        found += state.values() if isinstance(state, Mapping) else state if isinstance(state, (tuple, list)) else ()
+    described = meta.get("dataset_meta")
+    classes = described.get("classes") if isinstance(described, Mapping) else meta.get("CLASSES")
+    names = tuple(classes) if isinstance(classes, (tuple, list)) else ()
+    config = "\n".join(value for value in found if isinstance(value, str))
+    return config, names if all(isinstance(name, str) for name in names) else ()
 
 
 def _damaged(path: Path, reason: str) -> DetectorError:

@@ -40,7 +40,13 @@ _STORAGES = {f"{name}Storage": dtype for name, dtype in _DTYPES.items()}
 
 
 class Inert:
-    """Stands for whatever a checkpoint names beside tensors; takes any state and any items, and forgets them."""
+    """Stands for whatever a checkpoint names beside tensors; takes any items and forgets them.
+
+    Attributes:
+        state: what the pickle gave as the object's state, unused; None without one.
+    """
+
+    state: Any = None
 
     def __new__(cls, *arguments: Any, **settings: Any) -> Inert:
         """An empty stand-in, whatever it is made from."""
@@ -52,7 +58,9 @@ class Inert:
         """A stand-in for the result of calling what this stands for."""
         return Inert()
 
-    def __setstate__(self, state: Any) -> None: ...
+    def __setstate__(self, state: Any) -> None:
+        """Keep the state as it is."""
+        self.state = state
 
     def __setitem__(self, key: Any, value: Any) -> None: ...
 

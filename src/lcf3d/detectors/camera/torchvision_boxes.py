@@ -41,15 +41,15 @@ def clip_boxes(boxes: Tensor, height: int, width: int) -> Tensor:
     return torch.stack([boxes[..., i].clamp(0, width if i % 2 == 0 else height) for i in range(4)], dim=-1)
 
 
-def roi_features(maps: Sequence[Tensor], regions: Tensor, strides: Sequence[int]) -> Tensor:
-    """(R, C, 7, 7) features of (R, 4) regions, each from the map of its size (FPN, equation 1)."""
+def roi_features(maps: Sequence[Tensor], regions: Tensor, strides: Sequence[int], size: int = 7) -> Tensor:
+    """(R, C, size, size) features of (R, 4) regions, each from the map of its size (FPN, equation 1)."""
     area = ((regions[:, 2] - regions[:, 0]) * (regions[:, 3] - regions[:, 1])).clamp(min=0)
     level = torch.floor(torch.log2(area.sqrt() / 56 + 1e-6)).clamp(0, len(maps) - 1)
-    pooled = regions.new_zeros(len(regions), maps[0].shape[1], 7, 7)
+    pooled = regions.new_zeros(len(regions), maps[0].shape[1], size, size)
     for i, values in enumerate(maps):
         chosen = torch.nonzero(level == i).squeeze(1)
         if len(chosen):
-            pooled[chosen] = torchvision().ops.roi_align(values, [regions[chosen]], 7, 1 / strides[i], aligned=True)
+            pooled[chosen] = torchvision().ops.roi_align(values, [regions[chosen]], size, 1 / strides[i], aligned=True)
     return pooled
 
 

@@ -1,14 +1,13 @@
 """Faster R-CNN (Ren et al., NeurIPS 2015) with a ResNet-FPN, for checkpoints of OpenMMLab, on torchvision's operators.
 
 The parameter names are those of the checkpoints. What the parameters do not tell (anchors, image normalization, final
-suppression) is in `STYLES`: facts of the configurations of the LCF3D authors (KITTI) and of the nuImages models.
+suppression) is in `STYLES`. With a mask head it is Mask R-CNN (He et al., ICCV 2017), and masks come out.
 """
 
 # mypy: allow-subclassing-any
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,82 +21,22 @@ from lcf3d.detectors.camera.torchvision_boxes import (
     roi_features,
     select_detections,
 )
+from lcf3d.detectors.camera.torchvision_masks import MaskHead, instance_masks
+from lcf3d.detectors.camera.torchvision_styles import (
+    STYLES,
+    Style,
+    find_style,
+    normalization_of,
+    normalized,
+)
 from lcf3d.detectors.classes import to_classes
-from lcf3d.errors import ConfigError, DetectorError, ShapeError
-from lcf3d.networks.checkpoints import load_parameters, read_state_dict
+from lcf3d.detectors.downloads import local_path
+from lcf3d.errors import ConfigError, ShapeError
+from lcf3d.networks.checkpoints import load_parameters, read_notes, read_state_dict
 from lcf3d.networks.torch import Tensor, functional, nn, torch, torch_device, torchvision
-from lcf3d.structures import KITTI_CLASSES, Detections2D
+from lcf3d.structures import Detections2D
 
 STRIDES = (4, 8, 16, 32, 64)
-NUIMAGES_CLASSES = (
-    "car",
-    "truck",
-    "trailer",
-    "bus",
-    "construction_vehicle",
-    "bicycle",
-    "motorcycle",
-    "pedestrian",
-    "traffic_cone",
-    "barrier",
-)
-
-
-@dataclass(frozen=True)
-class Style:
-    """What a checkpoint's parameters do not tell.
-
-    Attributes:
-        ratios: height over width of the anchors.
-        scale: side of the square anchor in strides.
-        mean: subtracted from the image's channels, RGB.
-        std: then divided by, RGB.
-        bgr: channels in the order blue, green, red.
-        caffe: the stride of a bottleneck is in its first convolution.
-        image_size: longer and shorter side that the image is brought into, in pixels.
-        iou_threshold: of the final suppression, per class.
-        soft: that suppression lowers scores instead of removing boxes.
-        classes: in the order of the checkpoint.
-    """
-
-    ratios: tuple[float, ...]
-    scale: float
-    mean: tuple[float, float, float]
-    std: tuple[float, float, float]
-    bgr: bool
-    caffe: bool
-    image_size: tuple[int, int]
-    iou_threshold: float
-    soft: bool
-    classes: tuple[str, ...]
-
-
-STYLES: dict[str, Style] = {
-    "kitti": Style(
-        (0.5, 1.0, 2.0, 3.0),
-        4,
-        (123.675, 116.28, 103.53),
-        (58.395, 57.12, 57.375),
-        bgr=False,
-        caffe=False,
-        image_size=(1333, 800),
-        iou_threshold=0.7,
-        soft=True,
-        classes=KITTI_CLASSES,
-    ),
-    "nuscenes": Style(
-        (0.5, 1.0, 2.0),
-        8,
-        (123.675, 116.28, 103.53),
-        (1.0, 1.0, 1.0),
-        bgr=True,
-        caffe=True,
-        image_size=(1600, 900),
-        iou_threshold=0.5,
-        soft=False,
-        classes=NUIMAGES_CLASSES,
-    ),
-}
 
 
 class _Named(nn.Module):
@@ -185,21 +124,23 @@ class BoxHead(nn.Module):
 
 
 class _RoIHead(nn.Module):
-    def __init__(self, classes: int) -> None:
+    def __init__(self, classes: int, masks: bool) -> None:
         super().__init__()
         self.bbox_head = BoxHead(classes)
+        if masks:
+            self.mask_head = MaskHead(classes)
 
 
 class FasterRCNNNetwork(nn.Module):
-    """The network: image to regions to boxes."""
+    """The network: image to regions to boxes, and with ``masks`` a mask of each final box."""
 
-    def __init__(self, depth: int, style: Style) -> None:
+    def __init__(self, depth: int, style: Style, masks: bool = False) -> None:
         super().__init__()
         self.style = style
         self.backbone = Backbone(depth, style.caffe)
         self.neck = Neck()
         self.rpn_head = RPNHead(len(style.ratios))
-        self.roi_head = _RoIHead(len(style.classes))
+        self.roi_head = _RoIHead(len(style.classes), masks)
 
     def regions(self, maps: Sequence[Tensor], height: int, width: int) -> Tensor:
         """(R, 4) at most 1,000 proposals in pixels, best first."""
@@ -218,9 +159,13 @@ class FasterRCNNNetwork(nn.Module):
         all_boxes, all_scores, all_levels = all_boxes[valid], all_scores[valid], all_levels[valid]
         return all_boxes[torchvision().ops.batched_nms(all_boxes, all_scores, all_levels, 0.7)[:1000]]
 
-    def forward(self, image: Tensor, height: int, width: int) -> tuple[Tensor, Tensor]:
-        """(R, K) scores and (R, K, 4) boxes of the regions of a padded (1, 3, H, W) image of height x width pixels."""
-        maps = self.neck(self.backbone(image))
+    def maps(self, image: Tensor) -> list[Tensor]:
+        """The feature pyramid of a padded (1, 3, H, W) image."""
+        pyramid: list[Tensor] = self.neck(self.backbone(image))
+        return pyramid
+
+    def forward(self, maps: Sequence[Tensor], height: int, width: int) -> tuple[Tensor, Tensor]:
+        """(R, K) scores and (R, K, 4) boxes of the regions of an image of height x width pixels, from its `maps`."""
         regions = self.regions(maps, height, width)
         logits, residuals = self.roi_head.bbox_head(roi_features(maps[:4], regions, STRIDES))
         scales = residuals.new_tensor([0.1, 0.1, 0.2, 0.2])
@@ -228,20 +173,27 @@ class FasterRCNNNetwork(nn.Module):
         boxes = decode_boxes(regions[:, None].expand_as(residuals), residuals)
         return logits.softmax(dim=1)[:, :-1], clip_boxes(boxes, height, width)
 
+    def masks(self, maps: Sequence[Tensor], boxes: Tensor, labels: Tensor) -> Tensor:
+        """(D, 28, 28) probability of the object in each cell of (D, 4) final boxes of (D,) classes."""
+        logits = self.roi_head.mask_head(roi_features(maps[:4], boxes, STRIDES, size=14))
+        return logits[torch.arange(len(boxes)), labels].sigmoid()
+
 
 class TorchvisionFasterRCNN:
     """Faster R-CNN from an OpenMMLab checkpoint; a `CameraDetector`.
 
     Args:
-        path: checkpoint file; no code in it is executed.
+        path: checkpoint file, or the name of a published one, downloaded at first use; no code in it is executed.
         class_names: classes the detections shall have, mapped by name; the network's own without it.
         score_threshold: boxes need a higher score.
-        style: ``kitti`` or ``nuscenes``; found from the parameter shapes without it.
+        style: ``kitti``, ``nuscenes`` or ``coco``; found from the parameter shapes without it.
         device: torch device.
+        normalization: ``pytorch`` or ``caffe``, how images were normalized in training; without it what the
+            configuration in the file says, or else the style's.
 
     Raises:
-        DetectorError: the file cannot be read, or is no Faster R-CNN with ResNet-50 or -101 and FPN.
-        ConfigError: unknown style or device.
+        DetectorError: the file cannot be read, or is no Faster or Mask R-CNN with ResNet-50 or -101 and FPN.
+        ConfigError: unknown style, normalization or device.
     """
 
     def __init__(
@@ -251,15 +203,20 @@ class TorchvisionFasterRCNN:
         score_threshold: float = 0.05,
         style: str | None = None,
         device: str = "cpu",
+        normalization: str | None = None,
     ) -> None:
-        self._setup(read_state_dict(Path(path)), class_names, score_threshold, style, device)
+        file = local_path(str(path), "camera")
+        state = read_state_dict(file)
+        config, classes = read_notes(file)
+        told = normalization or normalization_of(config)
+        self._setup(state, class_names, score_threshold, style, device, told, classes)
 
     @classmethod
     def from_state_dict(cls, state: Mapping[str, Any], **options: Any) -> TorchvisionFasterRCNN:
         """The detector with given weights; options as of the class."""
         detector = cls.__new__(cls)
         settings = {"class_names": None, "score_threshold": 0.05, "style": None, "device": "cpu", **options}
-        detector._setup(state, **settings)
+        detector._setup(state, **{"normalization": None, **settings})
         return detector
 
     def _setup(
@@ -269,14 +226,18 @@ class TorchvisionFasterRCNN:
         score_threshold: float,
         style: str | None,
         device: str,
+        normalization: str | None,
+        classes: tuple[str, ...] = (),
     ) -> None:
         torchvision()
         if style is not None and style not in STYLES:
             raise ConfigError(f"style must be one of {', '.join(STYLES)}, got {style!r}")
-        self.style = STYLES[style] if style is not None else find_style(state)
+        found = STYLES[style] if style is not None else find_style(state, classes)
+        self.style = found if normalization is None else normalized(found, normalization)
         depth = 101 if "backbone.layer3.22.conv1.weight" in state else 50
+        self.has_masks = any(name.startswith("roi_head.mask_head.") for name in state)
         with torch.device("meta"):
-            network = FasterRCNNNetwork(depth, self.style)
+            network = FasterRCNNNetwork(depth, self.style, self.has_masks)
         load_parameters(network, state, f"Faster R-CNN with ResNet-{depth} and FPN")
         self.device = torch_device(device)
         self.network = network.eval().requires_grad_(False).to(self.device)
@@ -290,13 +251,19 @@ class TorchvisionFasterRCNN:
     def _detect(self, image: Image) -> Detections2D:
         tensor, scale = self.prepare(image)
         height, width = (round(side * scale) for side in image.shape[:2])
-        with torch.inference_mode():
-            scores, boxes = self.network(tensor, height, width)
         style = self.style
-        selected = select_detections(
-            boxes.cpu().numpy(), scores.cpu().numpy(), self.score_threshold, style.iou_threshold, style.soft
-        )
-        found = Detections2D(selected[0] / scale, selected[1], selected[2], style.classes)
+        with torch.inference_mode():
+            maps = self.network.maps(tensor)
+            scores, boxes = self.network(maps, height, width)
+            final, certain, labels = select_detections(
+                boxes.cpu().numpy(), scores.cpu().numpy(), self.score_threshold, style.iou_threshold, style.soft
+            )
+            masks = None
+            if self.has_masks:
+                chosen = torch.from_numpy(final).to(tensor), torch.from_numpy(labels).to(self.device)
+                cells = self.network.masks(maps, *chosen).cpu().numpy()
+                masks = instance_masks(cells, final / scale, image.shape[0], image.shape[1])
+        found = Detections2D(final / scale, certain, labels, style.classes, masks)
         return to_classes(found, self.class_names)
 
     def prepare(self, image: Image) -> tuple[Tensor, float]:
@@ -323,20 +290,3 @@ class TorchvisionFasterRCNN:
             image = image.flip(1)
         height, width = image.shape[-2:]
         return functional.pad(image, (0, -width % 32, 0, -height % 32))
-
-
-def find_style(state: Mapping[str, Any]) -> Style:
-    """The style whose numbers of classes and anchors are those of the parameters.
-
-    Raises:
-        DetectorError: none is, or the parameters are not of a Faster R-CNN.
-    """
-    names = ("roi_head.bbox_head.fc_cls.weight", "rpn_head.rpn_cls.weight")
-    if not all(name in state for name in names):
-        raise DetectorError(f"the checkpoint is no Faster R-CNN of OpenMMLab: it lacks {' and '.join(names)}")
-    classes, anchors = len(state[names[0]]) - 1, len(state[names[1]])
-    for style in STYLES.values():
-        if len(style.classes) == classes and len(style.ratios) == anchors:
-            return style
-    known = ", ".join(f"{name}: {len(s.classes)} and {len(s.ratios)}" for name, s in STYLES.items())
-    raise DetectorError(f"no Faster R-CNN with {classes} classes and {anchors} anchors a cell is known ({known})")
