@@ -7,7 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from lcf3d.detectors.base import Image
-from lcf3d.detectors.camera.torchvision_fasterrcnn import STYLES, FasterRCNNNetwork, TorchvisionFasterRCNN
+from lcf3d.detectors.camera.torchvision_fasterrcnn import FasterRCNNNetwork, TorchvisionFasterRCNN
+from lcf3d.detectors.camera.torchvision_styles import STYLES
 from lcf3d.detectors.lidar.benchmarking import Cost, count_gflops, cpu_threads, median_ms, peak_memory_mb
 from lcf3d.errors import ConfigError
 from lcf3d.networks.torch import torch
