@@ -43,7 +43,6 @@ SWEEP_PERIOD_S = 0.05
 """Time between LIDAR_TOP sweeps in seconds."""
 
 
-
 def read_lidar(path: Path) -> NDArray[np.float32]:
     """(N, 4) float32 ``x, y, z, intensity`` (0 to 255) of a LIDAR_TOP ``.pcd.bin`` file in the canonical frame.
 

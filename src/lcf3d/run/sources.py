@@ -9,7 +9,6 @@ from lcf3d.datasets.base import CameraSource, Dataset, LidarSource
 from lcf3d.detectors.base import CameraDetector, LidarDetector, cloud_request
 from lcf3d.detectors.lidar.sweeps import cloud_of, missing_of
 from lcf3d.detectors.named import load_detector
-from lcf3d.errors import DatasetError
 from lcf3d.structures import Detections2D, Detections3D, Frame
 
 
