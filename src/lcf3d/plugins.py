@@ -67,7 +67,7 @@ def parse(text: str) -> Spec:
     named, _, query = text.partition("?")
     kind, _, argument = named.partition(":")
     if not kind:
-        raise ConfigError(f"expected kind:argument, for example onnx:FILE or results:DIR, got {text!r}")
+        raise ConfigError(f"expected kind:argument, for example yolox:nano or results:DIR, got {text!r}")
     settings: dict[str, Setting] = {}
     for item in filter(None, query.split("&")):
         name, equals, value = item.partition("=")

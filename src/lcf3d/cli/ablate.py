@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 def ablate(
     dataset: Annotated[str, typer.Argument(help="kitti:ROOT, nuscenes:ROOT or another installed kind, with labels")],
     lidar: Annotated[str, typer.Option(help="LiDAR detector, kind:argument, for example results:DIR")],
-    camera: Annotated[str, typer.Option(help="camera detector, kind:argument, for example results:DIR or onnx:FILE")],
+    camera: Annotated[str, typer.Option(help="camera detector, kind:argument, for example results:DIR or yolox:nano")],
     split: Annotated[str | None, typer.Option(help="split of the dataset; the usual one if left out")] = None,
     tables: Annotated[str | None, typer.Option(help="nuScenes: folder of tables; the only one if left out")] = None,
     calibration: Annotated[

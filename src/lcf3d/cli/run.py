@@ -19,7 +19,7 @@ def run(
     lidar: Annotated[str, typer.Option(help="LiDAR detector, kind:argument, for example results:DIR")],
     out: Annotated[Path, typer.Option(help="folder for results, provenance and settings")],
     camera: Annotated[
-        str | None, typer.Option(help="camera detector, kind:argument, for example results:DIR or onnx:FILE")
+        str | None, typer.Option(help="camera detector, kind:argument, for example results:DIR or yolox:nano")
     ] = None,
     camera_left: Annotated[str | None, typer.Option(help="stereo pair: detector of the left camera")] = None,
     camera_right: Annotated[str | None, typer.Option(help="stereo pair: detector of the right camera")] = None,
@@ -37,7 +37,9 @@ def run(
     localizer: Annotated[
         str, typer.Option(help="geometric, network, onnx:FILE or frustum-pointnet:CHECKPOINT")
     ] = "geometric",
-    tiles: Annotated[int, typer.Option(min=1, help="overlapping tiles across wide images, for onnx: detectors")] = 1,
+    tiles: Annotated[
+        int, typer.Option(min=1, help="overlapping tiles across wide images, for yolox: and onnx: detectors")
+    ] = 1,
     calibration: Annotated[
         str, typer.Option(help="score calibration: a file of 'lcf3d calibrate', auto, or none")
     ] = "auto",
@@ -52,7 +54,7 @@ def run(
 
     Examples:
 
-    lcf3d run kitti:KITTI --split val --lidar results:pointpillars --camera onnx:yolox_nano.onnx --tiles 2 --out fused
+    lcf3d run kitti:KITTI --split val --lidar results:pointpillars --camera yolox:nano --tiles 2 --out fused
 
     lcf3d run kitti:KITTI --lidar results:DIR --camera-left results:L --camera-right results:R --out fused
 

@@ -158,7 +158,7 @@ class NuscenesDataset(BaseDataset):
             timestamp=1e-6 * float(data.timestamps_us[self._lidar_row(token)]),
             world_from_lidar=global_from_lidar,
             sequence=self.tables.scene_names[int(self.tables.samples.scenes[row])],
-            sweeps=lambda count: self.earlier_sweeps(token, count),
+            sweeps=None if self.sweeps else lambda count: self.earlier_sweeps(token, count),
         )
 
     def has_image(self, frame_id: str, camera: str) -> bool:

@@ -252,6 +252,14 @@ def test_sweeps_of_a_plain_frame():
         cloud_of(Frame("f"), CloudRequest(sweeps=1))
 
 
+def test_a_cloud_that_is_joined_already_is_left_alone(tmp_path):
+    root = write_world(tmp_path, points=True)
+    frame = NuscenesDataset(root, sweeps=1).frame("s1")
+    given = heard(frame, PRESETS["centerpoint-voxel01-nuscenes"].cloud)
+    assert given[:, 4].tolist() == [0, 0, np.float32(0.05)]
+    assert missing_of(frame, PRESETS["centerpoint-voxel01-nuscenes"].cloud) == ()
+
+
 def camera(name="left", width=100, height=50):
     forward = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
     projection = np.array([[50.0, 0, 50, 0], [0, 50, 25, 0], [0, 0, 1, 0]])

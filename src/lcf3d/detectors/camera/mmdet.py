@@ -44,7 +44,7 @@ class MmdetDetector:
         except ModuleNotFoundError as error:
             raise Lcf3dError(
                 f"mmdet detectors need mmdet 3 and mmcv in this environment (missing: {error.name}); see mmdetection's "
-                "installation page, or use onnx:FILE, which needs neither"
+                "installation page, or use yolox:nano or onnx:FILE, which need neither"
             ) from None
         try:
             self._model = init_detector(config, checkpoint, device=device)

@@ -69,7 +69,8 @@ def cloud_of(frame: Frame, request: CloudRequest) -> NDArray[np.floating]:
     points: NDArray[np.floating] | None = frame.points
     if points is None:
         raise DatasetError(f"frame {frame.id} has no scan for the LiDAR detector; pass results:PATH instead")
-    if request.sweeps:
+    # a cloud of more columns is joined already, or its fifth column is none of time: the network will tell
+    if request.sweeps and points.shape[1] == 4:
         sweeps = list(frame.sweeps(request.sweeps))
         if not sweeps and request.repeat_scan:
             sweeps = [Sweep(points, np.eye(4), 0.0)] * request.sweeps
@@ -81,7 +82,8 @@ def cloud_of(frame: Frame, request: CloudRequest) -> NDArray[np.floating]:
 def missing_of(frame: Frame, request: CloudRequest) -> tuple[str, ...]:
     """What a frame lacks of what a detector asks for, in words; the same words for every such frame."""
     notes = []
-    if request.sweeps and len(frame.sweeps(request.sweeps)) < request.sweeps:
+    joined = frame.points is not None and frame.points.shape[1] > 4
+    if not joined and len(frame.sweeps(request.sweeps)) < request.sweeps:
         notes.append(f"fewer earlier sweeps than the {request.sweeps} that the LiDAR detector was trained with")
     if request.view and _viewer(frame, request) is None:
         notes.append(
