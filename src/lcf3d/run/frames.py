@@ -71,7 +71,7 @@ class FrameRunner:
         marks.append(perf_counter())
         camera = self.detect_cameras(frame)
         marks.append(perf_counter())
-        fused = self._with_absent_cameras(self.fusion(frame, lidar, camera), frame)
+        fused = self._with_missing(self.fusion(frame, lidar, camera), frame)
         marks.append(perf_counter())
         self.folder.write(frame, fused)
         marks.append(perf_counter())
@@ -80,18 +80,18 @@ class FrameRunner:
         # a camera that this run was never to use is nothing to report
         unused = tuple(f"camera {camera.name} " for camera in frame.cameras if camera.name not in self.cameras)
         notes = tuple(note for note in fused.notes if not note.startswith(unused))
-        if isinstance(self.lidar, LidarOnScans):
-            notes += self.lidar.notes(frame)
         return replace(summarize(frame_id, fused, spent), notes=notes)
 
-    def _with_absent_cameras(self, fused: FusedDetections, frame: Frame) -> FusedDetections:
-        """The same with a note on each camera that the run uses and the dataset left out of this frame."""
+    def _with_missing(self, fused: FusedDetections, frame: Frame) -> FusedDetections:
+        """The same with a note on what the run uses and this frame lacks: cameras, and what the LiDAR detector wants."""
         there = {camera.name for camera in frame.cameras}
         notes = [
             f"camera {name} is missing from this frame or too far off in time and was not used: nobody looked there"
             for name in self.cameras
             if name not in there
         ]
+        if isinstance(self.lidar, LidarOnScans):
+            notes += self.lidar.notes(frame)
         return replace(fused, notes=(*fused.notes, *notes)) if notes else fused
 
     def detect_cameras(self, frame: Frame) -> dict[str, Detections2D]:

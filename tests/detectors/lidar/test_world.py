@@ -322,10 +322,8 @@ def test_what_reaches_a_network_of_kitti(shared, golden):
     reached = network_points(heard(frame, config.cloud), config)
     whole = network_points(heard(frame), config)
     expected = golden("second_kitti.one_thread").arrays["input"]
-    assert len(whole) > 1.2 * len(expected)
-    ours, theirs = ({tuple(row) for row in values.tolist()} for values in (reached, expected))
-    # the original cuts by planes through the image's edges: points within a pixel of them may differ
-    assert len(ours ^ theirs) <= 0.001 * len(theirs)
+    np.testing.assert_array_equal(reached, expected)
+    assert len(whole) > 3 * len(expected)
 
 
 @pytest.mark.real
