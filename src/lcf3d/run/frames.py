@@ -83,7 +83,7 @@ class FrameRunner:
         return replace(summarize(frame_id, fused, spent), notes=notes)
 
     def _with_missing(self, fused: FusedDetections, frame: Frame) -> FusedDetections:
-        """The same with a note on what the run uses and this frame lacks: cameras, and what the LiDAR detector wants."""
+        """The same with a note on what the run uses and this frame lacks: cameras, or what the LiDAR detector wants."""
         there = {camera.name for camera in frame.cameras}
         notes = [
             f"camera {name} is missing from this frame or too far off in time and was not used: nobody looked there"
