@@ -150,8 +150,14 @@ def settings_of(call: Any) -> set[str] | None:
     # what a partial has bound is part of the kind, not a setting
     bound = call.keywords if isinstance(call, partial) else {}
     first = {p.name for p in parameters[:1] if _is_argument(p)}
-    plain = {p.name for p in parameters if p.kind is not p.VAR_POSITIONAL and not _COMPOSED.search(str(p.annotation))}
+    plain = {p.name for p in parameters if p.kind is not p.VAR_POSITIONAL and _has_plain_form(str(p.annotation))}
     return plain - first - set(bound)
+
+
+def _has_plain_form(annotation: str) -> bool:
+    """Whether a parameter takes anything that a string can give: ``str | Sequence[str] | None`` does."""
+    forms = [form.strip() for form in annotation.split("|")]
+    return any(form != "None" and not _COMPOSED.search(form) for form in forms)
 
 
 def _is_argument(parameter: inspect.Parameter) -> bool:

@@ -132,6 +132,16 @@ def test_a_model_without_an_address_says_what_to_do(cli):
     assert "pass the path of your file" in str(error)
 
 
+def test_the_authors_networks_say_what_to_do():
+    pytest.importorskip("torch")
+    from lcf3d.detectors.camera.torchvision_fasterrcnn import TorchvisionFasterRCNN
+    from lcf3d.localizers.torch_localizer import TorchLocalizer
+
+    for build, name in ((TorchvisionFasterRCNN, "fasterrcnn-r101-kitti"), (TorchLocalizer, "frustum-pointnet-kitti")):
+        with pytest.raises(DetectorError, match=f"{name}: trained by the LCF3D authors.*pass the path of your file"):
+            build(name)
+
+
 def test_a_lidar_detector_is_named_by_its_published_file(tmp_path, monkeypatch):
     """``--lidar pointpillars:pointpillars-kitti``: downloaded from a server here, verified, and kept."""
     torch = pytest.importorskip("torch")

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from lcf3d.detectors.downloads import local_path
 from lcf3d.errors import DetectorError
 from lcf3d.fusion.frustum import FrustumProposals
 from lcf3d.localizers.onnx import localize
@@ -34,7 +35,7 @@ class TorchLocalizer:
     """
 
     def __init__(self, path: Path | str, device: str = "cpu") -> None:
-        state = read_state_dict(Path(path))
+        state = read_state_dict(local_path(str(path), "localizer"))
         self.spec = _spec_of(state, str(path))
         network = FrustumPointNet2(self.spec)
         load_parameters(network, _without_prefix(state), str(path))
