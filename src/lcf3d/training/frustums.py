@@ -17,7 +17,7 @@ from lcf3d.errors import DatasetError
 from lcf3d.formats.kitti import read_objects
 from lcf3d.fusion.frustum import enlarge_boxes, points_in_image_boxes
 from lcf3d.geometry.boxes import lidar_from_kitti, points_in_boxes, transform_boxes
-from lcf3d.geometry.camera import NEAR, project_boxes, project_points
+from lcf3d.geometry.camera import project_boxes, project_points
 from lcf3d.geometry.iou import image_iou
 from lcf3d.structures import BoolArray, Camera, Detections3D, FloatArray, IntArray
 from lcf3d.training.samples import ScanSample, read_scan
@@ -165,9 +165,7 @@ def _cut(
     scene: LabelledScene, box2d: FloatArray, right_box2d: FloatArray, label: int, box: FloatArray
 ) -> PooledFrustum:
     """The points behind a 2D box, with what is known of them."""
-    index, pixels, _ = points_in_image_boxes(
-        scene.points, np.array(scene.camera.pixels_from_lidar), NEAR, enlarge_boxes(box2d[None], WIDE)
-    )
+    index, pixels, _ = points_in_image_boxes(scene.points, scene.camera, enlarge_boxes(box2d[None], WIDE))
     if len(index) > MOST_POINTS:
         spread = np.arange(MOST_POINTS) * len(index) // MOST_POINTS
         index, pixels = index[spread], pixels[spread]
