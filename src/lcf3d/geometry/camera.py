@@ -6,6 +6,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from lcf3d.errors import ConfigError
 from lcf3d.geometry.boxes import EDGES, box_corners
 from lcf3d.geometry.lens import (
     NEAR,
@@ -120,3 +121,16 @@ def pixels_in_field(pixels: FloatArray, camera: Camera) -> BoolArray:
     if camera.distortion is None:
         return np.ones(len(pixels), dtype=bool)
     return directions_of_pixels(pixels, camera)[1]
+
+
+def require_pinhole(camera: Camera, what: str) -> None:
+    """Refuse a camera whose lens has no place in ``what``, a format or a method.
+
+    Raises:
+        ConfigError: the camera has a distortion.
+    """
+    if camera.distortion is not None:
+        raise ConfigError(
+            f"{what} has no place for the {camera.distortion.model} distortion of camera {camera.name!r}; undistort "
+            "its images first and give the pinhole camera that they then have"
+        )

@@ -12,6 +12,7 @@ import numpy as np
 from numba import njit
 
 from lcf3d.distortion import Distortion, Field
+from lcf3d.errors import ConfigError
 from lcf3d.geometry.boxes import EDGES, box_corners
 from lcf3d.structures import BoolArray, Camera, FloatArray
 
@@ -34,7 +35,8 @@ NUMBERS = 27
 def lens_numbers(camera: Camera) -> FloatArray:
     """(`NUMBERS`,) all that projecting through the lens of a camera with a distortion takes."""
     field, distortion, k = camera.lens_field, camera.distortion, camera.intrinsics
-    assert field is not None and distortion is not None
+    if field is None or distortion is None:
+        raise ConfigError(f"camera {camera.name!r} has no distortion: project as a pinhole camera does")
     numbers = np.empty(NUMBERS)
     numbers[RAYS:FISHEYE] = np.linalg.solve(k, camera.pixels_from_lidar).ravel()
     numbers[FISHEYE] = distortion.model == "fisheye"
@@ -105,7 +107,7 @@ def _edge_pixels(a, b, n, out):  # type: ignore[no-untyped-def]
     angle = math.atan2(sine, cosine)
     for i in range(3):
         w[i] /= max(sine, 1e-12)
-    pieces = min(max(int(math.ceil(angle / SAMPLE_ANGLE)), 1), PIECES)
+    pieces = min(max(math.ceil(angle / SAMPLE_ANGLE), 1), PIECES)
     # cos(t) u_z + sin(t) w_z is the cosine to the axis: largest at its peak, falling on both sides
     limit, cuts = n[COSINE], 0
     for s in range(pieces + 1):
@@ -231,7 +233,8 @@ def directions_of_pixels(pixels: FloatArray, camera: Camera) -> tuple[FloatArray
     A pixel outside of the field gives the direction on the field's border that lies on its side.
     """
     k, field, distortion = camera.intrinsics, camera.lens_field, camera.distortion
-    assert field is not None and distortion is not None
+    if field is None or distortion is None:
+        raise ConfigError(f"camera {camera.name!r} has no distortion: project as a pinhole camera does")
     y = (pixels[:, 1] - k[1, 2]) / k[1, 1]
     x = (pixels[:, 0] - k[0, 2] - k[0, 1] * y) / k[0, 0]
     radii = np.hypot(x, y)
@@ -257,9 +260,10 @@ def _fisheye_angles(angles: FloatArray, radii: FloatArray, distortion: Distortio
     return angles
 
 
-def _undistort(target: FloatArray, start: FloatArray, distortion: Distortion, field: Field) -> tuple[FloatArray, BoolArray]:
-    """(N, 2) ideal positions that a Brown-Conrady lens bends to ``target``, by Newton's method; and where that worked.
-    """
+def _undistort(
+    target: FloatArray, start: FloatArray, distortion: Distortion, field: Field
+) -> tuple[FloatArray, BoolArray]:
+    """(N, 2) ideal positions that a Brown-Conrady lens bends to ``target`` (Newton's method), and where that worked."""
     k, most = distortion.padded, math.tan(field.half_angle)
     p, q = start[:, 0], start[:, 1]
     for _ in range(12):
