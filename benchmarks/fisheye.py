@@ -1,6 +1,7 @@
-"""Fused AP with four fisheye cameras of 190 degrees and with six pinhole cameras, on the same simulated streets.
+"""Fused AP with fisheye cameras and with six pinhole cameras, on the same simulated streets.
 
-Both rigs look at the same scenes with the same LiDAR and about the same pixels an angle. The LiDAR branch is the labels
+``six lenses`` stand where the pinhole cameras do and see as far to the sides; ``four of 190 degrees`` look around the
+car with overlap, with the same pixels an angle in the middle. The LiDAR branch is the labels
 disturbed (a fifth missed, false boxes added), the same for both; the camera branch is what a perfect detector sees in
 the rendered images, or with ``--boxes`` the projections of the labels, disturbed alike.
 
@@ -22,6 +23,7 @@ from lcf3d.evaluation.center_distance import EvaluationBoxes, class_curves
 from lcf3d.geometry.camera import project_boxes
 from lcf3d.simulation.frames import SimulatedFrame, simulate_frame
 from lcf3d.simulation.presets import (
+    Preset,
     ego_from_nuscenes_camera,
     ego_from_nuscenes_lidar,
     get_preset,
@@ -53,6 +55,17 @@ def fisheye_rig(focal: float) -> tuple[Camera, ...]:
     )
 
 
+def with_lenses(cameras: Sequence[Camera]) -> tuple[Camera, ...]:
+    """The cameras with `LENS` in front, which shows the same directions at the left and right border of the image."""
+    changed = []
+    for camera in cameras:
+        projection = np.array(camera.projection)
+        side = np.array([np.arctan(camera.width / 2 / projection[0, 0])])
+        projection[0, 0] = projection[1, 1] = camera.width / 2 / float(LENS.radii(side)[0])
+        changed.append(replace(camera, projection=projection, distortion=LENS))
+    return tuple(changed)
+
+
 def lidar_branch(truth: Detections3D, rng: np.random.Generator) -> Detections3D:
     """The labels with a fifth missed, noise on the boxes, and a false box for every second one."""
     n = len(truth)
@@ -74,18 +87,14 @@ def lidar_branch(truth: Detections3D, rng: np.random.Generator) -> Detections3D:
 
 def camera_branch(seen: Detections2D, rng: np.random.Generator) -> Detections2D:
     """What is visible, a tenth missed, sides off by 3 % of the size."""
-    found = seen[rng.uniform(size=len(seen)) > 0.1]
-    sides = found.boxes[:, 2:] - found.boxes[:, :2]
-    boxes = found.boxes + rng.normal(0, 0.03, found.boxes.shape) * np.tile(sides, 2)
-    boxes[:, 2:] = np.maximum(boxes[:, 2:], boxes[:, :2] + 2)
-    return replace(found, boxes=boxes, scores=rng.beta(8, 2, len(found)))
+    sides = seen.boxes[:, 2:] - seen.boxes[:, :2]
+    boxes = seen.boxes + rng.normal(0, 0.03, seen.boxes.shape) * np.tile(sides, 2)
+    return replace(seen, boxes=boxes, scores=rng.beta(8, 2, len(seen)))[rng.uniform(size=len(seen)) > 0.1]
 
 
 def projections(truth: Detections3D, view: Camera) -> Detections2D:
-    """The boxes of the labels in an image, where they are `LEAST_PX` high."""
-    boxes, _ = project_boxes(truth.boxes, view)
-    tall = np.flatnonzero(boxes[:, 3] - boxes[:, 1] > LEAST_PX)
-    return Detections2D(boxes[tall], np.ones(len(tall)), truth.labels[tall], truth.class_names)
+    """The boxes of the labels in an image, of no height where they are not seen."""
+    return Detections2D(project_boxes(truth.boxes, view)[0], np.ones(len(truth)), truth.labels, truth.class_names)
 
 
 def table(parts: Sequence[Detections3D]) -> EvaluationBoxes:
@@ -115,39 +124,53 @@ def main() -> None:
     parser.add_argument("--scale", type=float, default=0.4, help="of the pinhole cameras' images")
     parser.add_argument("--street", help="kind of street; drawn if not given")
     parser.add_argument("--boxes", action="store_true", help="no images: 2D detections from the labels")
-    parser.add_argument("--picture", type=Path, help="draw the first frame's front fisheye image here")
+    parser.add_argument("--picture", type=Path, help="draw the first frame's front fisheye image here; no other rigs")
     arguments = parser.parse_args()
     pinhole = get_preset("nuscenes32").resized(arguments.scale)
     focal = float(pinhole.cameras[0].intrinsics[0, 0])
-    rigs = {"pinhole": pinhole, "fisheye": replace(pinhole, cameras=fisheye_rig(focal))}
+    rigs = {
+        "six pinholes": pinhole,
+        "six lenses": replace(pinhole, cameras=with_lenses(pinhole.cameras)),
+        "four of 190 degrees": replace(pinhole, cameras=fisheye_rig(focal)),
+    }
+    if arguments.picture:
+        rigs = {"four of 190 degrees": rigs["four of 190 degrees"]}
     truth, lidar_only = [], []
     fused: dict[str, list[Detections3D]] = {name: [] for name in rigs}
     fusion = LateCascadeFusion(FusionConfig(class_names=NUSCENES_CLASSES))
     for index in range(arguments.frames):
-        frames = {
-            name: simulate_frame(rig, arguments.seed, index, street=arguments.street, images=not arguments.boxes)
-            for name, rig in rigs.items()
-        }
-        kept = frames["pinhole"].labels
+
+        def look(rig: Preset, index: int = index) -> SimulatedFrame:
+            return simulate_frame(rig, arguments.seed, index, street=arguments.street, images=not arguments.boxes)
+
+        if arguments.boxes and not arguments.picture:
+            once = look(pinhole)
+            frames = {name: replace(once, preset=rig) for name, rig in rigs.items()}
+        else:
+            frames = {name: look(rig) for name, rig in rigs.items()}
+        kept = next(iter(frames.values())).labels
         kept = kept[np.hypot(kept.boxes[:, 0], kept.boxes[:, 1]) < 50]
         kept = kept[np.isin(kept.labels, [NUSCENES_CLASSES.index(c) for c in CLASSES])]
         lidar = lidar_branch(kept, np.random.default_rng([arguments.seed, index, 1]))
         truth.append(kept)
         lidar_only.append(lidar)
         for name, frame in frames.items():
-            rng = np.random.default_rng([arguments.seed, index, 2])
-            views = frame.preset.cameras
-            seen = [projections(kept, c) if arguments.boxes else frame.detections_2d(c.name) for c in views]
-            cameras = {c.name: camera_branch(found, rng) for c, found in zip(views, seen, strict=True)}
+            cameras = {}
+            for number, view in enumerate(frame.preset.cameras):
+                rng = np.random.default_rng([arguments.seed, index, number, 2])
+                seen = projections(kept, view) if arguments.boxes else frame.detections_2d(view.name)
+                found = camera_branch(seen, rng)
+                # drawn for all objects alike, so that the rigs differ by nothing else
+                cameras[view.name] = found[found.boxes[:, 3] - found.boxes[:, 1] > LEAST_PX]
             result = fusion(frame.frame, lidar, cameras)
             fused[name].append(result.detections)
-            if name == "fisheye" and index == 0 and arguments.picture:
+            if name == "four of 190 degrees" and index == 0 and arguments.picture:
                 draw(frame, result, arguments.picture)
         print(f"{index + 1} of {arguments.frames}", end="\r", flush=True)
     print(f"{arguments.frames} frames, {sum(len(t) for t in truth)} objects within 50 m, focal length {focal:.0f} px")
-    print(f"LiDAR branch alone   mAP {mean_ap(truth, lidar_only):.2f}")
+    print(f"LiDAR branch alone           mAP {mean_ap(truth, lidar_only):.2f}")
     for name, found in fused.items():
-        print(f"fused, {name:9}     mAP {mean_ap(truth, found):.2f}")
+        print(f"fused, {name:20}  mAP {mean_ap(truth, found):.2f}")
 
 
 def draw(frame: SimulatedFrame, fused: object, path: Path) -> None:
@@ -158,8 +181,10 @@ def draw(frame: SimulatedFrame, fused: object, path: Path) -> None:
 
     assert isinstance(fused, FusedDetections)
     view = frame.preset.cameras[0]
-    picture = draw_camera(frame.renders[view.name].image, view, Scene.from_fused(fused), title="fisheye, 190 degrees")
-    picture.save(path, quality=85)
+    picture = draw_camera(frame.renders[view.name].image, view, Scene.from_fused(fused))
+    # the sky and the bonnet have nothing in them
+    size = view.height
+    picture.crop((0, int(0.34 * size), size, int(0.78 * size))).save(path, quality=85)
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -90,7 +91,7 @@ class Camera:
         lens = checked_lens(self.distortion, projection[:, :3], self.width, self.height, self.name)
         object.__setattr__(self, "distortion", lens)
 
-    @property
+    @cached_property
     def lens_field(self) -> Field | None:
         """Where the lens sees; None for a pinhole camera, which sees all that is in front of it."""
         if self.distortion is None:

@@ -7,6 +7,7 @@ that their images are sampled along the arcs of directions that they span.
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import numpy as np
 from numba import njit
@@ -32,6 +33,7 @@ COEFFICIENTS = 19
 NUMBERS = 27
 
 
+@lru_cache(maxsize=64)
 def lens_numbers(camera: Camera) -> FloatArray:
     """(`NUMBERS`,) all that projecting through the lens of a camera with a distortion takes."""
     field, distortion, k = camera.lens_field, camera.distortion, camera.intrinsics
