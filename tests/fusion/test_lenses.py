@@ -13,7 +13,7 @@ from lcf3d.fusion.stereo_pairing import believable_pairs, curve_costs, epipolar_
 from lcf3d.geometry.camera import project_boxes, project_points
 from lcf3d.geometry.epipolar import fundamental_matrix
 from lcf3d.geometry.iou import bev_iou
-from lcf3d.provenance import Stage
+from lcf3d.provenance import Outcome
 from lcf3d.structures import InstanceMask
 from tests.fusion.scenes import camera, car, lidar, seen
 from tests.fusion.stereo_scenes import boxes2d, moved
@@ -75,7 +75,7 @@ def test_missed_cars_are_recovered_anywhere_in_the_image(lens, bearing):
     view = replace(view, distortion=lens)
     points = scan_all_around([box])
     result = LateCascadeFusion()(Frame("f", points, [view]), lidar([], []), {"left": seen(view, [box], [0.95])})
-    assert result.stages.tolist() == [Stage.RECOVERED]
+    assert result.outcomes.tolist() == [Outcome.RECOVERED]
     assert bev_iou(result.detections.boxes, box[None])[0, 0] > 0.5
 
 
@@ -99,7 +99,7 @@ def test_lidar_boxes_match_the_detections_of_a_lens(lens):
     result = LateCascadeFusion()(
         Frame("f", None, [view]), lidar(boxes, [0.6] * 3), {"left": seen(view, boxes, [0.9] * 3)}
     )
-    assert result.stages.tolist() == [Stage.MATCHED] * 3
+    assert result.outcomes.tolist() == [Outcome.MATCHED] * 3
 
 
 def rig(lens):
@@ -151,6 +151,6 @@ def test_stereo_fusion_recovers_through_lenses(lens):
     box = standing(10.0, 3.0, 4.0, 1.7, 1.5, 0.5)
     found = {view.name: seen(view, [box], [0.95]) for view in views}
     result = StereoLateCascadeFusion(StereoConfig())(Frame("f", scan([box]), views), lidar([], []), found)
-    assert result.stages.tolist() == [Stage.RECOVERED]
+    assert result.outcomes.tolist() == [Outcome.RECOVERED]
     assert result.camera.pair.max() >= 0
     assert bev_iou(result.detections.boxes, box[None])[0, 0] > 0.5
