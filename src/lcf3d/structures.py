@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from lcf3d.converters import Converters2D, Converters3D
 from lcf3d.distortion import Distortion, Field, checked_lens, field_of
 from lcf3d.errors import ConfigError, ShapeError
 
@@ -142,7 +143,7 @@ class InstanceMask:
 
 
 @dataclass(frozen=True, eq=False)
-class Detections3D:
+class Detections3D(Converters3D):
     """3D boxes of one frame with scores and labels, from a LiDAR detector, a fusion or an annotator.
 
     Attributes:
@@ -220,7 +221,7 @@ class Detections3D:
 
 
 @dataclass(frozen=True, eq=False)
-class Detections2D:
+class Detections2D(Converters2D):
     """2D boxes of one image with scores, labels and, if the detector has them, instance masks.
 
     Attributes:
