@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from lcf3d.detectors.classes import to_classes
 from lcf3d.errors import DetectorError
 from lcf3d.structures import Detections3D
 
@@ -126,3 +127,9 @@ def test_nuscenes_detection_boxes_come_through_a_transform():
     assert len(Detections3D.from_nuscenes_boxes([], ("truck",))) == 0
     with pytest.raises(DetectorError, match="a Box of the nuScenes devkit"):
         Detections3D.from_nuscenes_boxes([SimpleNamespace(x=1)])
+
+
+def test_classes_of_3d_detections_map_by_name():
+    found = Detections3D(np.array([CANONICAL] * 3), [0.9, 0.8, 0.7], [0, 1, 2], ("car", "van", "tram"))
+    mapped = to_classes(found, ("Pedestrian", "Car"))
+    assert [mapped.class_names[i] for i in mapped.labels] == ["Car", "Car"]

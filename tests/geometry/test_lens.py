@@ -8,7 +8,14 @@ from scipy.spatial.transform import Rotation
 from lcf3d import Camera, Distortion
 from lcf3d.errors import ConfigError
 from lcf3d.geometry.boxes import EDGES, box_corners
-from lcf3d.geometry.camera import pixel_rays, pixels_in_field, project_boxes, project_points, require_pinhole
+from lcf3d.geometry.camera import (
+    cut_by_field,
+    pixel_rays,
+    pixels_in_field,
+    project_boxes,
+    project_points,
+    require_pinhole,
+)
 from lcf3d.geometry.iou import image_iou
 from lcf3d.geometry.lens import edges_through_lens, local_projection, polygon_through_lens
 
@@ -245,3 +252,10 @@ def test_formats_without_lenses_refuse_them():
     require_pinhole(camera(None), "it")
     with pytest.raises(ConfigError, match="the KITTI layout has no place for the fisheye distortion of camera 'front'"):
         require_pinhole(camera(EQUIDISTANT), "the KITTI layout")
+
+
+def test_boxes_that_the_field_cuts_are_known():
+    view = camera(EQUIDISTANT, width=1400, height=1400)
+    boxes, _ = project_boxes(np.array([[0.0, -4, 0, 20, 2, 3, 0], [10, 0, 0, 4, 2, 2, 0]]), view)
+    assert cut_by_field(boxes, view).tolist() == [True, False]
+    assert cut_by_field(boxes, camera(None)).tolist() == [False, False]

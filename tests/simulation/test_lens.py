@@ -11,7 +11,7 @@ from lcf3d.simulation.presets import get_preset
 
 pytest.importorskip("embreex")
 
-from lcf3d.simulation.frames import simulate_frame  # noqa: E402
+from lcf3d.simulation.frames import simulate_frame
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from lcf3d.detectors.classes import class_mapping, read_class_names
+from lcf3d.detectors.classes import read_class_names, to_classes
 from lcf3d.errors import ConfigError, DatasetError, FormatError, Lcf3dError
 from lcf3d.files import read_json
 from lcf3d.formats.objects3d import from_mmdet3d, from_openpcdet
@@ -87,9 +87,7 @@ class ForeignLidarResults:
                     found.class_names,
                     None if velocities is None else velocities @ turn[:2, :2].T,
                 )
-            mapping = class_mapping(found.class_names, self.class_names)
-            full = {name: mapping.get(name, "") for name in found.class_names}
-            self._frames[frame_id] = found.with_classes(self.class_names, full)
+            self._frames[frame_id] = to_classes(found, self.class_names)
         if names and not any(len(found) for found in self._frames.values()):
             raise DatasetError(
                 f"{path} has detections of {', '.join(sorted(names))}, none of the classes {', '.join(class_names)}"

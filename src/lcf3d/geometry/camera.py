@@ -123,6 +123,19 @@ def pixels_in_field(pixels: FloatArray, camera: Camera) -> BoolArray:
     return directions_of_pixels(pixels, camera)[1]
 
 
+def cut_by_field(boxes: FloatArray, camera: Camera) -> BoolArray:
+    """(N,) whether (N, 4) pixel boxes reach the border of a lens's field within the image, to two pixels."""
+    cut = np.zeros(len(boxes), dtype=bool)
+    if camera.distortion is None:
+        return cut
+    middle = (boxes[:, :2] + boxes[:, 2:]) / 2
+    for side, way in ((0, -2.0), (1, -2.0), (2, 2.0), (3, 2.0)):
+        pixels = middle.copy()
+        pixels[:, side % 2] = boxes[:, side] + way
+        cut |= ~pixels_in_field(pixels, camera)
+    return cut
+
+
 def require_pinhole(camera: Camera, what: str) -> None:
     """Refuse a camera whose lens has no place in ``what``, a format or a method.
 

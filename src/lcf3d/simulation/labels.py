@@ -103,7 +103,7 @@ def _narrowed(
     """``bounds`` (4,) as wide as the outline of (T, 3, 3) world triangles, if all of it is before the camera."""
     points = (corners.reshape(-1, 3) - world_from_lidar[:3, 3]) @ world_from_lidar[:3, :3]
     pixels, depth = project_points(points, camera)
-    if (depth < NEAR * 5).any():
+    if (depth < NEAR * 5).any() or np.isnan(pixels).any():
         return bounds
     result = bounds.copy()
     result[[0, 2]] = np.clip([pixels[:, 0].min(), pixels[:, 0].max()], bounds[0], bounds[2])
