@@ -6,6 +6,7 @@ from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
+from lcf3d.distortion import Distortion
 from lcf3d.errors import Lcf3dError
 from lcf3d.structures import KITTI_CLASSES, NUSCENES_CLASSES, Camera, Detections2D, Detections3D, Frame, InstanceMask
 
@@ -76,6 +77,7 @@ __all__ = [
     "Dataset",
     "Detections2D",
     "Detections3D",
+    "Distortion",
     "Evidence",
     "Frame",
     "FusedDetections",

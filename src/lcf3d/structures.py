@@ -13,11 +13,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from lcf3d.converters import Converters2D, Converters3D
+from lcf3d.distortion import Distortion, Field, checked_lens, field_of
 from lcf3d.errors import ConfigError, ShapeError
 
 FloatArray = NDArray[np.float64]
@@ -54,7 +57,7 @@ def _array(value: ArrayLike, dtype: Any, shape: tuple[int | None, ...], what: st
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """A calibrated pinhole camera, with its pose at the moment of the LiDAR scan.
+    """A calibrated camera, with its pose at the moment of the LiDAR scan.
 
     Attributes:
         name: unique within a frame, for example ``left`` or ``CAM_FRONT``.
@@ -62,6 +65,8 @@ class Camera:
         camera_from_lidar: (4, 4) camera coordinates from LiDAR coordinates.
         width: image width in pixels.
         height: image height in pixels.
+        distortion: of the lens; None (and what a lens of zeros becomes) for a pinhole camera. ``projection`` is then
+            the camera's without it, and pixels, those of 2D detections too, are the ones of the image as it was taken.
     """
 
     name: str
@@ -69,6 +74,7 @@ class Camera:
     camera_from_lidar: FloatArray
     width: int
     height: int
+    distortion: Distortion | None = None
     pixels_from_lidar: FloatArray = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -83,6 +89,15 @@ class Camera:
         pixels_from_lidar = projection @ transform
         pixels_from_lidar.setflags(write=False)
         object.__setattr__(self, "pixels_from_lidar", pixels_from_lidar)
+        lens = checked_lens(self.distortion, projection[:, :3], self.width, self.height, self.name)
+        object.__setattr__(self, "distortion", lens)
+
+    @cached_property
+    def lens_field(self) -> Field | None:
+        """Where the lens sees; None for a pinhole camera, which sees all that is in front of it."""
+        if self.distortion is None:
+            return None
+        return field_of(self.distortion, self.intrinsics, self.width, self.height, self.name)
 
     @property
     def intrinsics(self) -> FloatArray:
@@ -128,7 +143,7 @@ class InstanceMask:
 
 
 @dataclass(frozen=True, eq=False)
-class Detections3D:
+class Detections3D(Converters3D):
     """3D boxes of one frame with scores and labels, from a LiDAR detector, a fusion or an annotator.
 
     Attributes:
@@ -206,7 +221,7 @@ class Detections3D:
 
 
 @dataclass(frozen=True, eq=False)
-class Detections2D:
+class Detections2D(Converters2D):
     """2D boxes of one image with scores, labels and, if the detector has them, instance masks.
 
     Attributes:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from lcf3d.distortion import Distortion
 from lcf3d.errors import ConfigError
 from lcf3d.geometry.boxes import bev_corners
 from lcf3d.geometry.camera import NEAR, project_boxes
@@ -190,3 +192,17 @@ def test_missing_sensors_still_give_a_picture(cameras: list[Camera]) -> None:
     empty = Scene(np.zeros((0, 7)), (), ())
     picture = draw_frame(Frame("f", None, cameras), empty)
     assert min(picture.size) > 100
+
+
+def test_edges_through_a_lens_bend_and_fit_its_bounds(camera: Camera) -> None:
+    lens = replace(camera, distortion=Distortion("fisheye", (0.02, 0.0, 0.0, 0.0)))
+    near = np.array([[4.0, 1.0, 0.0, 4.0, 2.0, 1.5, 0.4]])
+    edges = projected_edges(near, lens)[0]
+    edges = edges[np.isfinite(edges).all(axis=1)]
+    assert len(edges) > 12
+    ends = np.concatenate([edges[:, :2], edges[:, 2:]])
+    bounds, _ = project_boxes(near, lens)
+    limits = np.array([camera.width, camera.height] * 2)
+    np.testing.assert_allclose(np.clip([*ends.min(axis=0), *ends.max(axis=0)], 0, limits), bounds[0], atol=1e-6)
+    picture = draw_camera(None, lens, Scene(near, ("matched",), ("car",)), width=400)
+    assert len(np.unique(np.asarray(picture).reshape(-1, 3), axis=0)) > 2

@@ -19,7 +19,7 @@ from typing import Protocol
 from lcf3d.datasets.check import Finding, check_frames
 from lcf3d.errors import ConfigError, DatasetError
 from lcf3d.provenance import FusedDetections
-from lcf3d.structures import Detections2D, Detections3D, Frame
+from lcf3d.structures import Detections2D, Detections3D, FloatArray, Frame
 
 MISSING = ("error", "empty")
 """What may be done about result files that are not there: refuse them, or take them as frames without detections."""
@@ -76,6 +76,7 @@ class Dataset(Protocol):
         stereo_pair: names of the left and the right camera of a stereo pair; None where there is none.
         preset: the settings that a run takes unless told otherwise, see `lcf3d.fusion.config.FusionConfig.load`.
         evaluation: ``module:name`` of its `lcf3d.evaluation.protocol.Evaluation`.
+        native_from_canonical: (4, 4) the LiDAR frame that other tools use for it, from ours; None if they are equal.
     """
 
     ids: tuple[str, ...]
@@ -85,6 +86,7 @@ class Dataset(Protocol):
     stereo_pair: tuple[str, str] | None
     preset: str
     evaluation: str
+    native_from_canonical: FloatArray | None
 
     def __len__(self) -> int: ...
 
@@ -130,6 +132,7 @@ class BaseDataset(Sequence[Frame]):
     stereo_pair: tuple[str, str] | None = None
     preset: str = "default"
     evaluation: str = "lcf3d.evaluation.distance:DistanceEvaluation"
+    native_from_canonical: FloatArray | None = None
 
     @abstractmethod
     def frame(self, frame_id: str) -> Frame:

@@ -22,7 +22,7 @@ from lcf3d.files import atomic_path, write_json, write_text
 from lcf3d.formats.kitti import KittiObjects, objects_from_detections, write_objects
 from lcf3d.formats.nuscenes_boxes import NUSCENES_ATTRIBUTES, global_from_detections
 from lcf3d.geometry.boxes import points_in_boxes
-from lcf3d.geometry.camera import project_boxes
+from lcf3d.geometry.camera import project_boxes, require_pinhole
 from lcf3d.geometry.iou import image_area
 from lcf3d.geometry.rotation import invert_rigid, quaternions_from_matrices
 from lcf3d.structures import NUSCENES_CLASSES, Camera, Detections3D, FloatArray, Frame
@@ -168,6 +168,7 @@ def _label_objects(labels: Detections3D, camera: Camera) -> KittiObjects:
 
 def _calibration_text(camera: Camera) -> str:
     """A KITTI calibration file in which all four cameras are this one."""
+    require_pinhole(camera, "the KITTI layout")
     entries: dict[str, NDArray[Any]] = {f"P{i}": camera.projection for i in range(4)}
     entries["R0_rect"] = np.eye(3)
     entries["Tr_velo_to_cam"] = camera.camera_from_lidar[:3]
@@ -339,6 +340,7 @@ def _without_offset(camera: Camera) -> FloatArray:
 
     KITTI's projections hold the stereo baseline in their last column; nuScenes has no place for it but the pose.
     """
+    require_pinhole(camera, "the nuScenes layout")
     transform = np.array(camera.camera_from_lidar)
     transform[:3, 3] += np.linalg.solve(camera.intrinsics, camera.projection[:, 3])
     return transform

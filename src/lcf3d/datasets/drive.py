@@ -93,8 +93,10 @@ def write_drive(path: Path, frames: Sequence[ShippedFrame], made_by: str, qualit
         quality: of the WebP images.
     """
     from lcf3d.files import atomic_path
+    from lcf3d.geometry.camera import require_pinhole
 
     camera = frames[0].camera
+    require_pinhole(camera, "the demo's archive")
     about = {
         "made_by": made_by,
         "camera": {

@@ -88,6 +88,7 @@ class NuscenesDataset(BaseDataset):
     camera_names = CAMERAS
     preset = "nuscenes"
     evaluation = "lcf3d.evaluation.nuscenes_task:NuscenesEvaluation"
+    native_from_canonical = RAW_FROM_CANONICAL
 
     def __init__(
         self,

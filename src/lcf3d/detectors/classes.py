@@ -20,11 +20,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
 from lcf3d.geometry.iou import image_area
-from lcf3d.structures import Detections2D, InstanceMask, IntArray
+from lcf3d.structures import Detections2D, Detections3D, InstanceMask, IntArray
+
+Detections = TypeVar("Detections", Detections2D, Detections3D)
 
 COCO_CLASSES = tuple(
     """person,bicycle,car,motorcycle,airplane,bus,train,truck,boat,traffic light,fire hydrant,stop sign,parking meter,
@@ -83,12 +86,12 @@ def class_mapping(source: Sequence[str], target: Sequence[str]) -> dict[str, str
 
 
 def to_classes(
-    detections: Detections2D, class_names: Sequence[str], mapping: Mapping[str, str] | None = None
-) -> Detections2D:
-    """2D detections in another vocabulary, riders joined with what they ride.
+    detections: Detections, class_names: Sequence[str], mapping: Mapping[str, str] | None = None
+) -> Detections:
+    """Detections in another vocabulary; in 2D, riders joined with what they ride.
 
     Args:
-        detections: of any detector; COCO-like ones (with a class ``person``) pass through `join_riders`.
+        detections: of any detector; COCO-like 2D ones (with a class ``person``) pass through `join_riders`.
         class_names: target classes, for example `KITTI_CLASSES` or `NUSCENES_CLASSES`; where the detections have just
             these already, they are returned as they are.
         mapping: source name -> target name, on top of `class_mapping`; an empty target name drops the class.
@@ -98,7 +101,7 @@ def to_classes(
     """
     if detections.class_names == tuple(class_names):
         return detections
-    if PERSON in detections.class_names:
+    if isinstance(detections, Detections2D) and PERSON in detections.class_names:
         detections = join_riders(detections)
     names = class_mapping(detections.class_names, class_names)
     names.update(mapping or {})

@@ -20,6 +20,7 @@ from lcf3d.fusion.evidence import (
     to_probability,
 )
 from lcf3d.fusion.matching import Matches, View
+from lcf3d.geometry.camera import cut_by_field
 from lcf3d.structures import BoolArray, FloatArray, IntArray
 
 
@@ -56,6 +57,7 @@ def gather_evidence(
         camera_scores[here] = found.scores[matches.detection[here]]
         labels[here] = found.labels[matches.detection[here]]
         plain = miss_exposure(view.boxes[box], camera.width, camera.height)
+        plain = np.where(cut_by_field(view.boxes[box], camera), 0.0, plain)
         exposure = np.maximum(exposure, np.where(view.visible, plain, 0.0))
     table = evidence_table(
         to_log_odds(lidar.scores),

@@ -11,7 +11,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from lcf3d.geometry.boxes import YAW, wrap_angle
-from lcf3d.geometry.camera import NEAR
+from lcf3d.geometry.camera import pixel_rays
+from lcf3d.geometry.lens import NEAR, lens_numbers, project_through_lens
 from lcf3d.structures import BoolArray, Camera, Detections2D, FloatArray, IntArray
 
 MaskMode = Literal["box", "mask", "box+mask"]
@@ -118,20 +119,56 @@ class FrustumProposals:
         return result
 
 
-@njit(cache=True, nogil=True)
-def points_in_image_boxes(points, projection, near, boxes):  # type: ignore[no-untyped-def]
-    """Points whose projection falls in image boxes (numba).
+def points_in_image_boxes(
+    points: NDArray[np.floating], camera: Camera, boxes: FloatArray
+) -> tuple[IntArray, FloatArray, IntArray]:
+    """Points whose projection falls in image boxes.
 
     Args:
         points: (N, 3 or more) LiDAR-frame points; NaN ones are in no box.
-        projection: (3, 4) pixels from LiDAR.
-        near: least depth in metres.
+        camera: of the image.
         boxes: (K, 4) pixel boxes.
 
     Returns:
         (P,) point indices ordered by box then point, (P, 2) their pixels, (K + 1,) where each box's points begin.
     """
-    candidates, pixels = _project_into(points, projection, near, boxes)
+    if camera.distortion is None:
+        candidates, pixels = _project_into(points, np.array(camera.pixels_from_lidar), NEAR, boxes)
+    else:
+        candidates, pixels = _bend_into(points, lens_numbers(camera), boxes)
+    index, at, offsets = _by_box(candidates, pixels, boxes)
+    return index, at, offsets
+
+
+@njit(cache=True, nogil=True)
+def _bend_into(points, numbers, boxes):  # type: ignore[no-untyped-def]
+    """`_project_into` for a lens, whose numbers are those of `lens_numbers`."""
+    u1, v1, u2, v2 = _around(boxes)
+    pixels, depths = np.empty((len(points), 2)), np.empty(len(points))
+    project_through_lens(points, numbers, pixels, depths)
+    found = np.empty(len(points), np.int64)
+    count = 0
+    for n in range(len(points)):
+        u, v = pixels[n, 0], pixels[n, 1]
+        if (u >= u1) & (u <= u2) & (v >= v1) & (v <= v2):
+            found[count] = n
+            count += 1
+    return found[:count], pixels[found[:count]]
+
+
+@njit(cache=True, nogil=True)
+def _around(boxes):  # type: ignore[no-untyped-def]
+    """The rectangle around all boxes."""
+    u1, v1, u2, v2 = np.inf, np.inf, -np.inf, -np.inf
+    for k in range(len(boxes)):
+        u1, v1 = min(u1, boxes[k, 0]), min(v1, boxes[k, 1])
+        u2, v2 = max(u2, boxes[k, 2]), max(v2, boxes[k, 3])
+    return u1, v1, u2, v2
+
+
+@njit(cache=True, nogil=True)
+def _by_box(candidates, pixels, boxes):  # type: ignore[no-untyped-def]
+    """What `points_in_image_boxes` returns, of candidate points at pixels."""
     offsets = np.zeros(len(boxes) + 1, np.int64)
     hits = np.empty(len(candidates) + 1, np.int64)
     for k in range(len(boxes)):
@@ -158,10 +195,7 @@ def _project_into(points, projection, near, boxes):  # type: ignore[no-untyped-d
     a0, a1, a2, a3 = projection[0, 0], projection[0, 1], projection[0, 2], projection[0, 3]
     b0, b1, b2, b3 = projection[1, 0], projection[1, 1], projection[1, 2], projection[1, 3]
     c0, c1, c2, c3 = projection[2, 0], projection[2, 1], projection[2, 2], projection[2, 3]
-    u1, v1, u2, v2 = np.inf, np.inf, -np.inf, -np.inf
-    for k in range(len(boxes)):
-        u1, v1 = min(u1, boxes[k, 0]), min(v1, boxes[k, 1])
-        u2, v2 = max(u2, boxes[k, 2]), max(v2, boxes[k, 3])
+    u1, v1, u2, v2 = _around(boxes)
     found = np.empty(len(points) + 1, np.int64)
     count = 0
     for n in range(len(points)):
@@ -205,8 +239,7 @@ def _gaussian(pixels, x1, y1, x2, y2):  # type: ignore[no-untyped-def]
 
 def axis_yaws(boxes: FloatArray, camera: Camera) -> FloatArray:
     """(K,) headings in the LiDAR frame of the rays through the centres of (K, 4) pixel boxes."""
-    centres = np.concatenate([(boxes[:, :2] + boxes[:, 2:]) / 2, np.ones((len(boxes), 1))], axis=1)
-    rays = centres @ np.linalg.inv(camera.pixels_from_lidar[:, :3]).T
+    rays = pixel_rays((boxes[:, :2] + boxes[:, 2:]) / 2, camera)
     yaws: FloatArray = np.arctan2(rays[:, 1], rays[:, 0])
     return yaws
 
@@ -243,9 +276,7 @@ def extract_frustums(
         if not len(chosen):
             continue
         boxes = found.boxes[chosen]
-        index, pixels, offsets = points_in_image_boxes(
-            points, np.array(camera.pixels_from_lidar), NEAR, enlarge_boxes(boxes, enlargement)
-        )
+        index, pixels, offsets = points_in_image_boxes(points, camera, enlarge_boxes(boxes, enlargement))
         yaws = axis_yaws(boxes, camera)
         for k, d in enumerate(chosen):
             inside, at = index[offsets[k] : offsets[k + 1]], pixels[offsets[k] : offsets[k + 1]]
@@ -255,10 +286,7 @@ def extract_frustums(
             if other is not None:
                 view, found2, d2 = cameras[other[0]], detections[other[0]], other[1]
                 both, at2, _ = points_in_image_boxes(
-                    points[inside],
-                    np.array(view.pixels_from_lidar),
-                    NEAR,
-                    enlarge_boxes(found2.boxes[[d2]], enlargement),
+                    points[inside], view, enlarge_boxes(found2.boxes[[d2]], enlargement)
                 )
                 on_mask = on_mask[both] & _on_mask(found2, d2, at2, mask_mode)
                 inside, weight = inside[both], np.maximum(weight[both], gaussian_mask(at2, found2.boxes[d2]))

@@ -6,8 +6,10 @@ import numpy as np
 
 from lcf3d.errors import ConfigError
 from lcf3d.fusion.matching import Assignment, assign
+from lcf3d.geometry.camera import pixel_rays
 from lcf3d.geometry.epipolar import (
     baseline,
+    curve_distances,
     epipolar_lines,
     epipole,
     fundamental_matrix,
@@ -23,6 +25,8 @@ BELIEVABLE_HEIGHTS = (0.5, 4.5)
 BORDER = 2.0
 # pairs that must speak for exchanged views, and none against, before they are called so
 EXCHANGED_PAIRS = 3
+# a lens's box farther than this from the axis has no place in a plane image: depth is not checked there
+STRAIGHT_FIELD = np.deg2rad(75.0)
 # detections of lower score have no say in that: among many false ones some pair by chance
 CONFIDENT = 0.5
 
@@ -64,6 +68,35 @@ def epipolar_costs(left_boxes: FloatArray, right_boxes: FloatArray, fundamental:
     return np.where(np.isnan(costs), np.inf, costs)
 
 
+def curve_costs(left: Camera, right: Camera, left_boxes: FloatArray, right_boxes: FloatArray) -> FloatArray:
+    """`epipolar_costs` for cameras with lenses: distances to the epipolar curves of the left corners."""
+    costs = np.zeros((len(left_boxes), len(right_boxes)))
+    for corner in (slice(0, 2), slice(2, 4)):
+        costs += curve_distances(left, right, left_boxes[:, corner], right_boxes[:, corner])
+    return np.where(np.isnan(costs), np.inf, costs)
+
+
+def straight_boxes(boxes: FloatArray, camera: Camera) -> FloatArray:
+    """(N, 4) boxes as a pinhole camera of the same projection would have them, sides by the middles of their sides.
+
+    Those of a pinhole camera are returned as they are. NaN where a side is seen `STRAIGHT_FIELD` or more from the axis.
+    """
+    if camera.distortion is None or not len(boxes):
+        return boxes
+    middle = (boxes[:, :2] + boxes[:, 2:]) / 2
+    result = np.empty_like(boxes)
+    for side in range(4):
+        pixels = middle.copy()
+        pixels[:, side % 2] = boxes[:, side]
+        rays = pixel_rays(pixels, camera)
+        homogeneous = rays @ camera.pixels_from_lidar[:, :3].T
+        usable = homogeneous[:, 2] > np.cos(STRAIGHT_FIELD) * np.linalg.norm(rays, axis=1)
+        result[:, side] = np.divide(
+            homogeneous[:, side % 2], homogeneous[:, 2], out=np.full(len(boxes), np.nan), where=usable
+        )
+    return result
+
+
 def believable_pairs(
     left: Camera, right: Camera, left_boxes: FloatArray, right_boxes: FloatArray, tolerance_px: float
 ) -> BoolArray:
@@ -83,19 +116,25 @@ def believable_pairs(
     Returns:
         True also where nothing can be said: both vertical edges lie on the image's border.
     """
+    whole_left = [_off_border(left_boxes, column, left) for column in (0, 2)]
+    whole_right = [_off_border(right_boxes, column, right) for column in (0, 2)]
+    bent_widths = left_boxes[:, 2] - left_boxes[:, 0]
+    left_boxes, right_boxes = straight_boxes(left_boxes, left), straight_boxes(right_boxes, right)
     total, count = np.zeros((2, len(left_boxes), len(right_boxes)))
     for column in (0, 2):
         left_points = np.stack([left_boxes[:, column], left_boxes[:, 1::2].mean(axis=1)], axis=1)
         right_points = np.stack([right_boxes[:, column], right_boxes[:, 1::2].mean(axis=1)], axis=1)
         inverse = inverse_depths(left, right, left_points, right_points)
-        whole = _off_border(left_boxes, column, left)[:, None] & _off_border(right_boxes, column, right)
+        whole = whole_left[column // 2][:, None] & whole_right[column // 2]
         usable = whole & ~np.isnan(inverse)
         total[usable] += inverse[usable]
         count += usable
     inverse = np.divide(total, count, out=np.full_like(total, np.nan), where=count > 0)
     # a height of h pixels at inverse depth q is h / (f q) metres
     heights = (left_boxes[:, 3] - left_boxes[:, 1])[:, None] / left.intrinsics[1, 1]
-    slack = tolerance_px * inverse_depth_per_pixel(left, right)
+    slack: FloatArray = np.full((len(left_boxes), 1), tolerance_px * inverse_depth_per_pixel(left, right))
+    if left.distortion is not None:  # a pixel of the lens's image is more of them off the axis
+        slack *= np.maximum((left_boxes[:, 2] - left_boxes[:, 0]) / np.maximum(bent_widths, 1e-9), 1.0)[:, None]
     low, high = heights / BELIEVABLE_HEIGHTS[1] - slack, heights / BELIEVABLE_HEIGHTS[0] + slack
     return np.asarray(np.isnan(inverse) | ((inverse >= low) & (inverse <= high)))
 
@@ -145,7 +184,11 @@ def pair_views(
     """
     if not len(left_found) or not len(right_found):
         return np.zeros((0, 2), dtype=np.int64)
-    distance = epipolar_costs(left_found.boxes, right_found.boxes, fundamental_matrix(left, right)) / 2
+    if left.distortion is None and right.distortion is None:
+        costs = epipolar_costs(left_found.boxes, right_found.boxes, fundamental_matrix(left, right))
+    else:
+        costs = curve_costs(left, right, left_found.boxes, right_found.boxes)
+    distance = costs / 2
     # what a pair saves against two lonely boxes; the margin keeps a pair right at the gate from rounding
     saved = gate_px + 1e-6 - distance
     possible = (left_found.labels[:, None] == right_found.labels) & (saved > 0)

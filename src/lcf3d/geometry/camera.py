@@ -6,15 +6,28 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from lcf3d.errors import ConfigError
 from lcf3d.geometry.boxes import EDGES, box_corners
+from lcf3d.geometry.lens import (
+    NEAR,
+    bound_through_lens,
+    directions_of_pixels,
+    lens_numbers,
+    project_through_lens,
+)
 from lcf3d.structures import BoolArray, Camera, FloatArray
-
-# nothing nearer to the camera than this is projected, in metres
-NEAR = 0.1
 
 
 def project_points(points: NDArray[np.floating], camera: Camera) -> tuple[FloatArray, FloatArray]:
-    """Pixels (N, 2) and depths (N,) of (N, 3 or more) LiDAR-frame points; pixels are NaN where depth <= `NEAR`."""
+    """Pixels (N, 2) and depths (N,) of (N, 3 or more) LiDAR-frame points.
+
+    Pixels are NaN where depth <= `NEAR`; through a lens, where the point is outside of its field (a fisheye lens may
+    see points of negative depth).
+    """
+    if camera.distortion is not None:
+        pixels, depths = np.empty((len(points), 2)), np.empty(len(points))
+        project_through_lens(points, lens_numbers(camera), pixels, depths)
+        return pixels, depths
     homogeneous = points[:, :3] @ camera.pixels_from_lidar[:, :3].T + camera.pixels_from_lidar[:, 3]
     depths = homogeneous[:, 2]
     pixels = np.full((len(points), 2), np.nan)
@@ -59,7 +72,8 @@ def _bound_projections(corners, edges, projection, near, bounds):  # type: ignor
 def project_boxes(boxes: FloatArray, camera: Camera) -> tuple[FloatArray, BoolArray]:
     """Image boxes of 3D boxes (docs/method.md, projection; paper section 4.1.3).
 
-    Each box is cut at the near plane, projected, bounded by an axis-aligned rectangle and clipped to the image.
+    Each box is cut at the near plane, or where the field of a lens ends, projected, bounded by an axis-aligned
+    rectangle and clipped to the image.
 
     Args:
         boxes: (N, 7) canonical boxes.
@@ -69,7 +83,10 @@ def project_boxes(boxes: FloatArray, camera: Camera) -> tuple[FloatArray, BoolAr
         (N, 4) pixel boxes clipped to the image, zeros where not visible; and (N,) whether they have positive area.
     """
     bounds = np.empty((len(boxes), 4))
-    _bound_projections(box_corners(boxes), EDGES, np.array(camera.pixels_from_lidar), NEAR, bounds)
+    if camera.distortion is None:
+        _bound_projections(box_corners(boxes), EDGES, np.array(camera.pixels_from_lidar), NEAR, bounds)
+    else:
+        bound_through_lens(boxes, box_corners(boxes), EDGES, lens_numbers(camera), bounds)
     clipped = np.empty_like(bounds)
     np.clip(bounds[:, 0::2], 0, camera.width, out=clipped[:, 0::2])
     np.clip(bounds[:, 1::2], 0, camera.height, out=clipped[:, 1::2])
@@ -82,3 +99,51 @@ def depths_of(points: NDArray[np.floating], camera: Camera) -> FloatArray:
     """(N,) depths in metres of (N, 3) LiDAR-frame points along the camera's optical axis."""
     depths: FloatArray = points[:, :3] @ camera.pixels_from_lidar[2, :3] + camera.pixels_from_lidar[2, 3]
     return depths
+
+
+def pixel_rays(pixels: FloatArray, camera: Camera) -> FloatArray:
+    """(N, 3) directions in the LiDAR frame, of any length, of the rays through (N, 2) pixels.
+
+    A pixel outside of a lens's field gives the direction on its border that lies on the pixel's side.
+    """
+    if camera.distortion is None:
+        homogeneous = np.concatenate([pixels, np.ones((len(pixels), 1))], axis=1)
+        rays: FloatArray = homogeneous @ np.linalg.inv(camera.pixels_from_lidar[:, :3]).T
+        return rays
+    directions, _ = directions_of_pixels(pixels, camera)
+    camera_from_lidar = np.linalg.solve(camera.intrinsics, camera.pixels_from_lidar[:, :3])
+    turned: FloatArray = directions @ np.linalg.inv(camera_from_lidar).T
+    return turned
+
+
+def pixels_in_field(pixels: FloatArray, camera: Camera) -> BoolArray:
+    """(N,) whether (N, 2) pixels show anything: a fisheye lens may leave the corners of its image black."""
+    if camera.distortion is None:
+        return np.ones(len(pixels), dtype=bool)
+    return directions_of_pixels(pixels, camera)[1]
+
+
+def cut_by_field(boxes: FloatArray, camera: Camera) -> BoolArray:
+    """(N,) whether (N, 4) pixel boxes reach the border of a lens's field within the image, to two pixels."""
+    cut = np.zeros(len(boxes), dtype=bool)
+    if camera.distortion is None:
+        return cut
+    middle = (boxes[:, :2] + boxes[:, 2:]) / 2
+    for side, way in ((0, -2.0), (1, -2.0), (2, 2.0), (3, 2.0)):
+        pixels = middle.copy()
+        pixels[:, side % 2] = boxes[:, side] + way
+        cut |= ~pixels_in_field(pixels, camera)
+    return cut
+
+
+def require_pinhole(camera: Camera, what: str) -> None:
+    """Refuse a camera whose lens has no place in ``what``, a format or a method.
+
+    Raises:
+        ConfigError: the camera has a distortion.
+    """
+    if camera.distortion is not None:
+        raise ConfigError(
+            f"{what} has no place for the {camera.distortion.model} distortion of camera {camera.name!r}; undistort "
+            "its images first and give the pinhole camera that they then have"
+        )

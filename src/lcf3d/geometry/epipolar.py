@@ -1,7 +1,8 @@
 """Two-view geometry of calibrated cameras: fundamental matrix, epipolar lines, depth along them (paper section 4.2.3).
 
 Everything comes from the full projections ``pixels_from_lidar``, so that it holds for any two cameras: turned against
-each other, of different focal length, or with a translation column in ``projection`` as KITTI writes it.
+each other, of different focal length, or with a translation column in ``projection`` as KITTI writes it. That of lines
+is for pinhole cameras; through a lens they are curves (`curve_distances`).
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from lcf3d.errors import ConfigError
+from lcf3d.geometry.camera import pixel_rays, project_points
 from lcf3d.structures import Camera, FloatArray
 
 # cameras nearer to each other than this see no parallax worth the name, in metres
@@ -128,4 +130,37 @@ def inverse_depths(left: Camera, right: Camera, left_points: FloatArray, right_p
         # pixel(q) = (far + q near) / its third coordinate, solved for q
         inverse = way * far[:, 2:] / (speed[:, None] - way * near[2])
     result: FloatArray = np.where((far[:, 2:] > 0) & (speed[:, None] - way * near[2] > 0), inverse, np.nan)
+    return result
+
+
+def curve_distances(left: Camera, right: Camera, left_points: FloatArray, right_points: FloatArray) -> FloatArray:
+    """(N, M) pixel distances of M right pixels to the epipolar curves of N left pixels, for cameras with any lens.
+
+    The plane of a left ray and the baseline cuts the right camera's image in a curve. The foot of a right pixel on it
+    is where the right ray's nearest direction in that plane is seen; of a pinhole camera this is as good as the
+    distance to the line for pixels near to it.
+
+    Args:
+        left: camera of ``left_points``.
+        right: camera of ``right_points``.
+        left_points: (N, 2) pixels.
+        right_points: (M, 2) pixels.
+
+    Returns:
+        NaN for a left pixel at the epipole, infinite where the foot lies outside of the right camera's field.
+    """
+    centre = camera_centre(right)
+    along = centre - camera_centre(left)
+    rays, others = pixel_rays(left_points, left), pixel_rays(right_points, right)
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    others /= np.linalg.norm(others, axis=1, keepdims=True)
+    normals = np.cross(rays, along / np.linalg.norm(along))
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = np.divide(normals, length, out=np.full_like(normals, np.nan), where=length > 1e-9)
+    off = normals @ others.T
+    feet = others[None] - off[..., None] * normals[:, None]
+    # as points far along the feet's directions: a metre is as good as any length, the camera's centre is given
+    pixels, _ = project_points((centre + feet).reshape(-1, 3), right)
+    distances = np.linalg.norm(pixels.reshape(*off.shape, 2) - right_points, axis=-1)
+    result: FloatArray = np.where(np.isnan(off), np.nan, np.where(np.isnan(distances), np.inf, distances))
     return result

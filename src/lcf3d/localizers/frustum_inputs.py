@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lcf3d.fusion.frustum import FrustumProposals
+from lcf3d.geometry.camera import pixel_rays
 from lcf3d.localizers.spec import LocalizerSpec
 from lcf3d.structures import BoolArray, Camera, FloatArray, IntArray
 
@@ -72,12 +73,11 @@ def frustum_rays(proposals: FrustumProposals) -> FloatArray:
 
 def box_rays(boxes: FloatArray, axis_yaw: FloatArray, camera: Camera) -> FloatArray:
     """(K, 4) slopes, see `frustum_rays`, of (K, 4) pixel boxes with their axes' (K,) headings."""
-    inverse = np.linalg.inv(camera.pixels_from_lidar[:, :3])
     middle = (boxes[:, :2] + boxes[:, 2:]) / 2
-    pixels = np.ones((4, len(boxes), 3))
+    pixels = np.empty((4, len(boxes), 2))
     pixels[:2, :, 0], pixels[0, :, 1], pixels[1, :, 1] = middle[:, 0], boxes[:, 1], boxes[:, 3]
     pixels[2:, :, 1], pixels[2, :, 0], pixels[3, :, 0] = middle[:, 1], boxes[:, 0], boxes[:, 2]
-    directions = pixels @ inverse.T
+    directions = pixel_rays(pixels.reshape(-1, 2), camera).reshape(4, len(boxes), 3)
     cos, sin = np.cos(axis_yaw), np.sin(axis_yaw)
     along = cos * directions[..., 0] + sin * directions[..., 1]
     across = cos * directions[..., 1] - sin * directions[..., 0]

@@ -14,6 +14,7 @@ from numba import njit
 from lcf3d.fusion.frustum import FrustumProposals
 from lcf3d.geometry.boxes import wrap_angle
 from lcf3d.geometry.ground import fit_plane, lowest_returns
+from lcf3d.geometry.lens import local_projection
 from lcf3d.localizers.cluster import BIN, BINS, GAP_PER_METRE, MOST_POINTS, range_profile, take_cluster, weigh_points
 from lcf3d.localizers.fit import (
     BOX2D,
@@ -89,7 +90,10 @@ class GeometricLocalizer:
         projections, image_sizes = np.empty((count, 3, 4)), np.empty((count, 2))
         for k, c in enumerate(proposals.camera_index):
             camera = proposals.cameras[c]
-            projections[k] = _turned(camera.pixels_from_lidar, float(proposals.axis_yaw[k]))
+            pixels_from_lidar = camera.pixels_from_lidar
+            if camera.distortion is not None:
+                pixels_from_lidar = local_projection(camera, proposals.boxes2d[k])
+            projections[k] = _turned(pixels_from_lidar, float(proposals.axis_yaw[k]))
             image_sizes[k] = camera.width, camera.height
         rows = np.array([_row(self.shapes.get(name)) for name in proposals.class_names])[proposals.labels]
         gaussian = proposals.gaussian

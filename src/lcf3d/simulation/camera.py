@@ -1,4 +1,4 @@
-"""A pinhole camera's image of a scene: primary, shadow and openness rays, shading, smooth edges, exposure and noise."""
+"""A camera's image of a scene: primary, shadow and openness rays, shading, smooth edges, exposure and noise."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from lcf3d.geometry.camera import pixel_rays, pixels_in_field
+from lcf3d.geometry.epipolar import camera_centre
 from lcf3d.simulation.light import Light
 from lcf3d.simulation.materials import camera_table
 from lcf3d.simulation.meshes.primitives import Mesh
@@ -65,8 +67,12 @@ def camera_rays(
     """World position (3,) of the camera and unit directions (N, 3) through pixel positions (u, v).
 
     A point that projects to (u, v) belongs to pixel (floor(u), floor(v)); pixel (i, j) has its centre at
-    (i + 0.5, j + 0.5).
+    (i + 0.5, j + 0.5). Pixels outside of a lens's field get directions on its border.
     """
+    if camera.distortion is not None:
+        origin = world_from_lidar[:3, :3] @ camera_centre(camera) + world_from_lidar[:3, 3]
+        rays = pixel_rays(np.stack([u, v], axis=1).astype(np.float64), camera) @ world_from_lidar[:3, :3].T
+        return origin, rays.astype(np.float32)
     inverse = np.linalg.inv(camera.intrinsics)
     centre = -inverse @ camera.projection[:, 3]
     world_from_camera = world_from_lidar @ np.linalg.inv(camera.camera_from_lidar)
@@ -126,6 +132,10 @@ def render(camera: Camera, stage: Stage, rng: np.random.Generator, exposure: flo
     if len(edge):
         radiance[edge] = _smooth(stage, camera, u, v, edge, opened, forward, radiance[edge])
     image = develop(radiance.reshape(height, width, 3), rng, exposure, stage.light.night > 0, photo)
+    if camera.distortion is not None:
+        black = ~pixels_in_field(np.stack([u, v], axis=1).astype(np.float64), camera)
+        owner[black], depth[black] = 0, np.inf
+        image[black.reshape(height, width)] = 0
     return Render(image, owner.reshape(height, width), depth.reshape(height, width))
 
 

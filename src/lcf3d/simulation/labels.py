@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from lcf3d.formats.kitti import KittiObjects
 from lcf3d.geometry.boxes import box_corners, kitti_from_lidar, observation_angle, wrap_angle
-from lcf3d.geometry.camera import NEAR, project_boxes, project_points
+from lcf3d.geometry.camera import pixels_in_field, project_boxes, project_points
+from lcf3d.geometry.lens import NEAR, edges_through_lens
 from lcf3d.simulation.actors import KITTI_CLASS, Actor
 from lcf3d.simulation.camera import camera_rays
 from lcf3d.simulation.presets import KITTI_FOCAL
@@ -102,7 +103,7 @@ def _narrowed(
     """``bounds`` (4,) as wide as the outline of (T, 3, 3) world triangles, if all of it is before the camera."""
     points = (corners.reshape(-1, 3) - world_from_lidar[:3, 3]) @ world_from_lidar[:3, :3]
     pixels, depth = project_points(points, camera)
-    if (depth < NEAR * 5).any():
+    if (depth < NEAR * 5).any() or np.isnan(pixels).any():
         return bounds
     result = bounds.copy()
     result[[0, 2]] = np.clip([pixels[:, 0].min(), pixels[:, 0].max()], bounds[0], bounds[2])
@@ -120,6 +121,8 @@ def _coverage(
     """(hidden share of the part inside the image, share outside) of one object, by a raster of rays at it alone."""
     around = _unclipped_bounds(box, camera)
     u, v = _raster(around)
+    shown = pixels_in_field(np.stack([u, v], axis=1), camera)
+    u, v = u[shown], v[shown]
     origin, direction = camera_rays(camera, world_from_lidar, u, v)
     met = RayTracer(corners).first_hits(origin, direction).triangle >= 0
     if not met.any():
@@ -136,8 +139,12 @@ def _coverage(
 def _unclipped_bounds(box: FloatArray, camera: Camera) -> FloatArray:
     """Bounds of the projected box, at most two image sizes beyond the image."""
     corner = box_corners(box[None])[0]
-    points = corner @ camera.pixels_from_lidar[:, :3].T + camera.pixels_from_lidar[:, 3]
     limit = np.array([-2.0 * camera.width, -2.0 * camera.height, 3.0 * camera.width, 3.0 * camera.height])
+    if camera.distortion is not None:
+        bent = edges_through_lens(box[None], camera).reshape(-1, 2)
+        bent = bent[~np.isnan(bent[:, 0])]
+        return np.concatenate([bent.min(axis=0), bent.max(axis=0)]) if len(bent) else limit
+    points = corner @ camera.pixels_from_lidar[:, :3].T + camera.pixels_from_lidar[:, 3]
     if (points[:, 2] < NEAR * 5).any():
         return limit
     pixels = points[:, :2] / points[:, 2:]

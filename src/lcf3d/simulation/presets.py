@@ -85,12 +85,11 @@ class Preset:
             raise ConfigError(f"the image scale must lie above 0 and at most 1, got {factor:g}")
         scale = np.diag([factor, factor, 1.0])
         cameras = tuple(
-            Camera(
-                c.name,
-                scale @ c.projection,
-                c.camera_from_lidar,
-                max(8, round(c.width * factor)),
-                max(8, round(c.height * factor)),
+            replace(
+                c,
+                projection=scale @ c.projection,
+                width=max(8, round(c.width * factor)),
+                height=max(8, round(c.height * factor)),
             )
             for c in self.cameras
         )

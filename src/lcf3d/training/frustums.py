@@ -17,7 +17,7 @@ from lcf3d.errors import DatasetError
 from lcf3d.formats.kitti import read_objects
 from lcf3d.fusion.frustum import enlarge_boxes, points_in_image_boxes
 from lcf3d.geometry.boxes import lidar_from_kitti, points_in_boxes, transform_boxes
-from lcf3d.geometry.camera import NEAR, project_boxes, project_points
+from lcf3d.geometry.camera import pixel_rays, project_boxes, project_points
 from lcf3d.geometry.iou import image_iou
 from lcf3d.structures import BoolArray, Camera, Detections3D, FloatArray, IntArray
 from lcf3d.training.samples import ScanSample, read_scan
@@ -165,9 +165,7 @@ def _cut(
     scene: LabelledScene, box2d: FloatArray, right_box2d: FloatArray, label: int, box: FloatArray
 ) -> PooledFrustum:
     """The points behind a 2D box, with what is known of them."""
-    index, pixels, _ = points_in_image_boxes(
-        scene.points, np.array(scene.camera.pixels_from_lidar), NEAR, enlarge_boxes(box2d[None], WIDE)
-    )
+    index, pixels, _ = points_in_image_boxes(scene.points, scene.camera, enlarge_boxes(box2d[None], WIDE))
     if len(index) > MOST_POINTS:
         spread = np.arange(MOST_POINTS) * len(index) // MOST_POINTS
         index, pixels = index[spread], pixels[spread]
@@ -216,7 +214,7 @@ def _edge_angle(sample: ScanSample, camera: Camera, rng: np.random.Generator, ot
     chosen = rng.choice(near)
     x, y = sample.boxes[chosen, :2]
     column = float(rng.choice([0, camera.width]))
-    ray = np.linalg.solve(camera.intrinsics, [column, camera.height / 2, 1.0]) @ camera.camera_from_lidar[:3, :3]
+    (ray,) = pixel_rays(np.array([[column, camera.height / 2]]), camera)
     half = np.arctan2(0.5 * np.hypot(*sample.boxes[chosen, 3:5]), distance[chosen])
     return float(np.arctan2(ray[1], ray[0]) - np.arctan2(y, x) + rng.uniform(-0.8, 0.8) * half)
 

@@ -10,6 +10,8 @@ import PIL.Image
 from numpy.typing import NDArray
 
 from lcf3d.geometry.boxes import LENGTH, YAW, bev_corners
+from lcf3d.geometry.camera import pixel_rays
+from lcf3d.geometry.epipolar import camera_centre
 from lcf3d.structures import Camera, FloatArray
 from lcf3d.visualization.canvas import Canvas
 from lcf3d.visualization.scene import COLOURS, TRUTH_COLOUR, Scene
@@ -147,18 +149,12 @@ def _ring_label(radius: float, view: BevView) -> tuple[float, float]:
 
 def _field_of_view(camera: Camera, view: BevView) -> FloatArray:
     """(2, 4) lines from a camera along the left and right border of its image, on the ground plan."""
-    lidar_from_camera = np.linalg.inv(camera.camera_from_lidar)
-    inverse = np.linalg.inv(camera.intrinsics)
-    # a projection with a baseline (KITTI's P2) has its centre beside the reference camera's
-    centre = -inverse @ camera.projection[:, 3]
-    middle = camera.height / 2
+    # of the whole projection: one with a baseline (KITTI's P2) has its centre beside the reference camera's
+    centre = camera_centre(camera)
     reach = 2 * max(view.width, view.height) / view.pixels_per_metre
-    lines = []
-    for column in (0.0, float(camera.width)):
-        direction = inverse @ np.array([column, middle, 1.0])
-        ends = np.stack([centre, centre + reach * direction]) @ lidar_from_camera[:3, :3].T + lidar_from_camera[:3, 3]
-        lines.append(view.pixels(ends[:, :2]).ravel())
-    return np.array(lines)
+    sides = pixel_rays(np.array([[0, camera.height / 2], [camera.width, camera.height / 2]]), camera)
+    sides /= np.linalg.norm(sides, axis=1, keepdims=True)
+    return np.array([view.pixels(np.stack([centre, centre + reach * side])[:, :2]).ravel() for side in sides])
 
 
 def _outline(box: FloatArray, view: BevView) -> FloatArray:

@@ -9,7 +9,8 @@ import PIL.Image
 from numpy.typing import NDArray
 
 from lcf3d.geometry.boxes import EDGES, box_corners
-from lcf3d.geometry.camera import NEAR, project_boxes, project_points
+from lcf3d.geometry.camera import project_boxes, project_points
+from lcf3d.geometry.lens import NEAR, edges_through_lens, polygon_through_lens
 from lcf3d.structures import Camera, FloatArray
 from lcf3d.visualization.canvas import Canvas
 from lcf3d.visualization.scene import CAMERA_COLOUR, COLOURS, TRUTH_COLOUR, Scene
@@ -24,8 +25,12 @@ _FRONT = [0, 1, 5, 4]
 def projected_edges(boxes: FloatArray, camera: Camera) -> FloatArray:
     """(N, 12, 4) pixel segments ``x1, y1, x2, y2`` of the edges of (N, 7) boxes, cut at the near plane.
 
-    Edges wholly behind the near plane are NaN. Order: `lcf3d.geometry.boxes.EDGES`.
+    Edges wholly behind the near plane are NaN. Order: `lcf3d.geometry.boxes.EDGES`. Through a lens the edges bend:
+    (N, S, 4) segments of all of them, NaN where there is nothing.
     """
+    if camera.distortion is not None:
+        bent = edges_through_lens(boxes, camera)
+        return np.concatenate([bent[:, :, :-1], bent[:, :, 1:]], axis=-1).reshape(len(boxes), -1, 4)
     corners = box_corners(boxes)
     homogeneous = corners @ camera.pixels_from_lidar[:, :3].T + camera.pixels_from_lidar[:, 3]
     a, b = homogeneous[:, EDGES[:, 0]], homogeneous[:, EDGES[:, 1]]
@@ -40,6 +45,14 @@ def projected_edges(boxes: FloatArray, camera: Camera) -> FloatArray:
         segments = np.concatenate([start[..., :2] / start[..., 2:], end[..., :2] / end[..., 2:]], axis=-1)
     segments[behind] = np.nan
     return segments
+
+
+def _front_face(corners: FloatArray, camera: Camera) -> FloatArray:
+    """Pixels around a face of (4, 3) corners; empty unless all of it is in front of the camera."""
+    if camera.distortion is not None:
+        return polygon_through_lens(corners, camera)
+    pixels, depths = project_points(corners, camera)
+    return pixels if (depths > NEAR).all() else pixels[:0]
 
 
 def scaled_camera(camera: Camera, scale: float) -> Camera:
@@ -99,8 +112,8 @@ def _draw_boxes(canvas: Canvas, camera: Camera, scene: Scene) -> None:
     edges = projected_edges(scene.boxes, camera)
     order = [i for i in scene.drawing_order if visible[i]]
     for i in order:
-        front, depths = project_points(box_corners(scene.boxes[i : i + 1])[0, _FRONT], camera)
-        if scene.outcomes[i] != "dropped" and (depths > NEAR).all():
+        front = _front_face(box_corners(scene.boxes[i : i + 1])[0, _FRONT], camera)
+        if scene.outcomes[i] != "dropped" and len(front):
             canvas.polygon(front, COLOURS[scene.outcomes[i]], 0.16)
     for i in order:
         if scene.outcomes[i] == "dropped":

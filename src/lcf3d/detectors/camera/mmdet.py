@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lcf3d.detectors.base import Image
 from lcf3d.detectors.classes import to_classes
 from lcf3d.errors import ConfigError, DetectorError, Lcf3dError
-from lcf3d.structures import Detections2D, InstanceMask
+from lcf3d.structures import Detections2D
 
 
 class MmdetDetector:
@@ -60,19 +58,5 @@ class MmdetDetector:
         """Detections in (H, W, 3) uint8 RGB images."""
         # mmdet takes images as OpenCV reads them: blue, green, red
         results = self._infer(self._model, [np.ascontiguousarray(image[..., ::-1]) for image in images])
-        return [to_classes(self._convert(result.pred_instances), self.class_names) for result in results]
-
-    def _convert(self, instances: Any) -> Detections2D:
-        """Detections of mmdet's ``pred_instances``, in the model's own classes."""
-        scores = _array(instances.scores)
-        kept = scores > self.score_threshold
-        masks = None
-        if "masks" in instances:
-            masks = tuple(InstanceMask.from_image(mask) for mask in _array(instances.masks)[kept])
-        boxes, labels = _array(instances.bboxes)[kept], _array(instances.labels)[kept]
-        return Detections2D(boxes, scores[kept], labels, self._own_classes, masks)
-
-
-def _array(tensor: Any) -> NDArray[Any]:
-    """A torch tensor (on any device) as an array."""
-    return np.asarray(tensor.detach().cpu().numpy())
+        found = (Detections2D.from_mmdet(result, self._own_classes) for result in results)
+        return [to_classes(boxes[boxes.scores > self.score_threshold], self.class_names) for boxes in found]
