@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lcf3d.errors import FormatError, MissingExtraError
-from lcf3d.formats.files import atomic_path
+from lcf3d.files import atomic_path
 
 TEXT = np.dtype(object)
 """The type to ask for in `read_columns` where a column holds text."""
@@ -31,17 +31,20 @@ def read_columns(path: Path, columns: Mapping[str, Any], optional: tuple[str, ..
     """
     arrow = _arrow("reading feather files")
     try:
-        table = arrow.feather.read_table(path, memory_map=False)
+        with arrow.OSFile(str(path)) as file:
+            present = arrow.ipc.open_file(file).schema.names
+            absent = [name for name in columns if name not in present and name not in optional]
+            if absent:
+                raise FormatError(
+                    f"{path} has no column {', '.join(absent)}; it holds {', '.join(present) or 'no columns'}"
+                )
+            wanted = [i for i, name in enumerate(present) if name in columns]
+            options = arrow.ipc.IpcReadOptions(included_fields=wanted)
+            table = arrow.ipc.open_file(file, options=options).read_all()
     except FileNotFoundError:
         raise FormatError(f"{path} does not exist") from None
     except (arrow.ArrowInvalid, OSError) as error:
         raise FormatError(f"{path} cannot be read as a feather file ({str(error).splitlines()[0]})") from None
-    present = set(table.column_names)
-    absent = [name for name in columns if name not in present and name not in optional]
-    if absent:
-        raise FormatError(
-            f"{path} has no column {', '.join(absent)}; it holds {', '.join(table.column_names) or 'no columns'}"
-        )
     return {name: _column(path, table, name, kind) for name, kind in columns.items() if name in present}
 
 
@@ -77,6 +80,7 @@ def _arrow(purpose: str) -> Any:
     try:
         import pyarrow
         import pyarrow.feather
+        import pyarrow.ipc
     except ImportError:
         raise MissingExtraError("pyarrow", "formats", purpose) from None
     return pyarrow
