@@ -42,18 +42,47 @@ class KittiCalibration:
     Attributes:
         projections: (3, 4) by name ``P0`` to ``P3``, pixels from the rectified reference camera.
         camera_from_lidar: (4, 4) rectified reference camera from Velodyne, ``R0_rect @ Tr_velo_to_cam``.
+        lidar_from_imu: (4, 4) Velodyne from the GPS/IMU unit, or None where the file does not say.
     """
 
     projections: Mapping[str, FloatArray]
     camera_from_lidar: FloatArray
+    lidar_from_imu: FloatArray | None = None
 
 
 def read_calibration(path: Path) -> KittiCalibration:
-    """Read a calibration file; spellings of the object and of the tracking benchmark are understood.
+    """Read a calibration file; spellings of the object, tracking and odometry benchmarks are understood.
 
     Raises:
         DatasetError: the file does not exist.
         FormatError: an entry is missing or malformed; names it.
+    """
+    entries = read_entries(path)
+    rectification, reference_from_lidar = np.eye(4), np.eye(4)
+    if "Tr" in entries:
+        # odometry: from the Velodyne to the rectified reference camera at once
+        reference_from_lidar[:3] = matrix_entry(path, entries, ("Tr",), (3, 4))
+    else:
+        rectification[:3, :3] = matrix_entry(path, entries, ("R0_rect", "R_rect"), (3, 3))
+        reference_from_lidar[:3] = matrix_entry(path, entries, ("Tr_velo_to_cam", "Tr_velo_cam"), (3, 4))
+    projections: dict[str, FloatArray] = {"P2": matrix_entry(path, entries, ("P2",), (3, 4))}
+    others: tuple[str, ...] = ("P0", "P1", "P3")
+    for name in others:
+        if name in entries:
+            projections[name] = matrix_entry(path, entries, (name,), (3, 4))
+    lidar_from_imu = None
+    if "Tr_imu_to_velo" in entries or "Tr_imu_velo" in entries:
+        lidar_from_imu = np.eye(4)
+        lidar_from_imu[:3] = matrix_entry(path, entries, ("Tr_imu_to_velo", "Tr_imu_velo"), (3, 4))
+    return KittiCalibration(projections, rectification @ reference_from_lidar, lidar_from_imu)
+
+
+def read_entries(path: Path, skip: Sequence[str] = ()) -> dict[str, FloatArray]:
+    """The numbers of a calibration file by the name that begins each line, but for the names in ``skip``.
+
+    Raises:
+        DatasetError: the file does not exist.
+        FormatError: a line is malformed; names it.
     """
     try:
         text = path.read_text(encoding="utf-8")
@@ -64,25 +93,25 @@ def read_calibration(path: Path) -> KittiCalibration:
     entries: dict[str, FloatArray] = {}
     for number, line in enumerate(text.splitlines(), 1):
         name, *fields = line.replace(":", " ").split() or [""]
+        if name in skip:
+            continue
         try:
             entries[name] = np.array([float(f) for f in fields])
         except ValueError:
             raise FormatError(f"{path}:{number}: {name} must be followed by numbers") from None
         if not np.isfinite(entries[name]).all():
             raise FormatError(f"{path}:{number}: {name} holds NaN or infinite values")
-    rectification = np.eye(4)
-    rectification[:3, :3] = _matrix(path, entries, ("R0_rect", "R_rect"), (3, 3))
-    reference_from_lidar = np.eye(4)
-    reference_from_lidar[:3] = _matrix(path, entries, ("Tr_velo_to_cam", "Tr_velo_cam"), (3, 4))
-    projections: dict[str, FloatArray] = {"P2": _matrix(path, entries, ("P2",), (3, 4))}
-    others: tuple[str, ...] = ("P0", "P1", "P3")
-    for name in others:
-        if name in entries:
-            projections[name] = _matrix(path, entries, (name,), (3, 4))
-    return KittiCalibration(projections, rectification @ reference_from_lidar)
+    return entries
 
 
-def _matrix(path: Path, entries: Mapping[str, FloatArray], names: Sequence[str], shape: tuple[int, int]) -> FloatArray:
+def matrix_entry(
+    path: Path, entries: Mapping[str, FloatArray], names: Sequence[str], shape: tuple[int, int]
+) -> FloatArray:
+    """The matrix under the first of ``names`` that the file at ``path`` has.
+
+    Raises:
+        FormatError: it has none of them, or of another size.
+    """
     for name in names:
         if name in entries:
             if entries[name].size != shape[0] * shape[1]:
