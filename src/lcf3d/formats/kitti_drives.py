@@ -43,7 +43,8 @@ def read_oxts(path: Path) -> FloatArray:
 def poses_from_oxts(records: FloatArray) -> FloatArray:
     """(N, 4, 4) ``world_from_imu`` of (N, 6 or more) records.
 
-    The world's origin is where the first record was taken, its axes point east, north and up. Positions are drawn on a Mercator map that is true to scale at the first record's latitude.
+    The world's origin is where the first record was taken, its axes point east, north and up. Positions are drawn on a
+    Mercator map that is true to scale at the first record's latitude.
     """
     if not len(records):
         return np.zeros((0, 4, 4))
