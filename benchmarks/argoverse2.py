@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from statistics import median
 from time import perf_counter
@@ -23,7 +24,7 @@ from lcf3d import Detections2D, Detections3D, FusionConfig, LateCascadeFusion
 from lcf3d.datasets.argoverse2 import RING_CAMERAS, Argoverse2Dataset, detections_by_frame, results_of_frames
 from lcf3d.evaluation.argoverse import ArgoverseMetrics, evaluate_argoverse
 from lcf3d.formats.argoverse import ARGOVERSE_CLASSES, read_submission
-from lcf3d.geometry.camera import depths_of, project_boxes
+from lcf3d.geometry.camera import depths_of, project_boxes, project_points
 from lcf3d.geometry.iou import iou_3d
 from lcf3d.provenance import Stage
 from lcf3d.structures import Camera, FloatArray, Frame
@@ -33,6 +34,10 @@ from lcf3d.visualization.scene import Scene
 CONFIG = FusionConfig.preset("default", class_names=ARGOVERSE_CLASSES)
 LEAST_HEIGHT_PX = 12
 HIDDEN_SHARE = 0.7
+SHOWN_CAMERAS = tuple(
+    f"ring_{name}"
+    for name in ("front_left", "front_center", "front_right", "side_left", "rear_left", "side_right", "rear_right")
+)
 
 
 def simulated_detections(frame: Frame, rng: np.random.Generator) -> dict[str, Detections2D]:
@@ -118,6 +123,31 @@ def measure_recovery(frames: Sequence[Frame], cameras: Sequence[str], seed: int)
     )
 
 
+def point_pictures(frame: Frame, scene: Scene) -> tuple[Frame, Scene]:
+    """The frame with its scan drawn in place of images, near points bright; upper and lower quarter are cut off."""
+    cameras, images, drawn = [], {}, {}
+    for camera in frame.cameras:
+        top, height = camera.height // 4, camera.height // 2
+        projection = np.array(camera.projection)
+        projection[1] -= top * projection[2]
+        view = replace(camera, projection=projection, height=height)
+        picture = np.full((height, view.width, 3), 24, dtype=np.uint8)
+        if frame.points is not None:
+            pixels, depths = project_points(frame.points, view)
+            inside = (depths > 1) & (pixels >= 4).all(axis=1) & (pixels < [view.width - 4, height - 4]).all(axis=1)
+            order = np.flatnonzero(inside)[np.argsort(-depths[inside])]
+            bright = np.clip(235 - 45 * np.log(depths[order]), 40, 235).astype(np.uint8)
+            for dy, dx in np.ndindex(5, 5):
+                rows, columns = pixels[order, 1].astype(int) + dy - 2, pixels[order, 0].astype(int) + dx - 2
+                picture[rows, columns] = bright[:, None]
+        cameras.append(view)
+        images[camera.name] = picture
+        if camera.name in scene.image_boxes:
+            found = scene.image_boxes[camera.name]
+            drawn[camera.name] = replace(found, boxes=found.boxes - [0, top, 0, top])
+    return Frame(frame.id, frame.points, cameras, images, frame.labels), replace(scene, image_boxes=drawn)
+
+
 def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -135,7 +165,9 @@ def main() -> None:
         start = perf_counter()
         evaluate_argoverse(truth, lidar)
         spent.append(perf_counter() - start)
-    print(f"metrics of {len(lidar)} detections and {len(truth)} annotations: {1e3 * median(spent):.0f} ms (median of 9)")
+    print(
+        f"metrics of {len(lidar)} detections and {len(truth)} annotations: {1e3 * median(spent):.0f} ms (median of 9)"
+    )
 
     fusion, rng, fused = LateCascadeFusion(CONFIG), np.random.default_rng(arguments.seed), {}
     scanned = []
@@ -155,7 +187,7 @@ def main() -> None:
         frame = scanned[0] if scanned else dataset[0]
         scene = Scene.from_fused(fused[frame.id], frame.labels)
         arguments.picture.parent.mkdir(parents=True, exist_ok=True)
-        draw_frame(frame, scene, RING_CAMERAS).save(arguments.picture, quality=88)
+        draw_frame(*point_pictures(frame, scene), SHOWN_CAMERAS).save(arguments.picture, quality=85)
 
 
 if __name__ == "__main__":

@@ -8,20 +8,11 @@ from pathlib import Path
 
 from lcf3d.datasets.base import require_folder
 from lcf3d.datasets.images import ImageFiles
-from lcf3d.datasets.kitti import (
-    CAMERAS,
-    DEFAULT_IMAGE_SIZE,
-    IMAGE_SIZES,
-    PARTS,
-    KittiLikeDataset,
-    image_camera,
-    is_tracking,
-    read_points,
-)
+from lcf3d.datasets.kitti import PARTS, KittiLikeDataset, cameras_of, is_tracking, read_points
 from lcf3d.datasets.kitti_drives import Drive, TrackingDrive, odometry_drives, raw_drives, tracking_drives
 from lcf3d.errors import ConfigError, DatasetError
 from lcf3d.formats.kitti import read_frame_ids
-from lcf3d.structures import KITTI_CLASSES, Camera, Frame
+from lcf3d.structures import KITTI_CLASSES, Frame
 
 
 class KittiSequences(KittiLikeDataset):
@@ -57,11 +48,12 @@ class KittiSequences(KittiLikeDataset):
         if len(self.drives) < len(drives):
             raise DatasetError(f"{root} holds two sequences of one name; pass a folder that holds one of them")
         if sequence is not None:
-            if sequence not in self.drives:
-                raise DatasetError(
-                    f"{root} has no sequence {sequence!r}; it has {', '.join(list(self.drives)[:5])} ..."
-                )
-            self.drives = {sequence: self.drives[sequence]}
+            # a name of digits may have lost its leading zeros on the command line
+            chosen = [name for name in self.drives if name.lstrip("0") == sequence.lstrip("0")]
+            if not chosen:
+                first = ", ".join(list(self.drives)[:5])
+                raise DatasetError(f"{root} has no sequence {sequence!r} among its {len(drives)}: {first} ...")
+            self.drives = {name: self.drives[name] for name in chosen}
         self._listed = None if split is None else set(read_frame_ids(self._split_path(split)))
         if self._listed is not None and not self.ids:
             raise DatasetError(f"{self._split_path(split or '')} names no sequence and no frame that is there")
@@ -113,22 +105,12 @@ class KittiSequences(KittiLikeDataset):
             FormatError: a file of its drive is malformed.
         """
         drive, number = self.place(frame_id)
-        images, cameras = self.image_paths(frame_id), []
-        for name, _, key in CAMERAS:
-            if key not in drive.calibration.projections:
-                continue
-            matrix = drive.calibration.projections[key]
-            if name in images:
-                cameras.append(image_camera(name, images[name], matrix, drive.calibration.camera_from_lidar))
-                continue
-            known = IMAGE_SIZES.get(round(float(matrix[0, 0]), 4), DEFAULT_IMAGE_SIZE)
-            size = drive.image_sizes.get(name, known)
-            cameras.append(Camera(name, matrix, drive.calibration.camera_from_lidar, *size))
+        images = self.image_paths(frame_id)
         scan = drive.scans.get(number)
         return Frame(
             frame_id,
             points=None if scan is None else lambda: read_points(scan),
-            cameras=cameras,
+            cameras=cameras_of(drive.calibration, images, drive.image_sizes),
             images=ImageFiles(images),
             labels=(lambda: drive.labels(number, self.class_names)) if drive.has_labels else None,
             timestamp=drive.time(number),
