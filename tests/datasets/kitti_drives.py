@@ -52,7 +52,8 @@ def make_tracking(root: Path, sequences: tuple[str, ...] = ("0000", "0001")) -> 
         _write(part / f"calib/{name}.txt", calibration + _row("Tr_imu_velo", LIDAR_FROM_IMU[:3]))
         lines = format_objects(labels()).splitlines()
         _write(
-            part / f"label_02/{name}.txt", "".join(f"{i} {k} {text}\n" for i in range(2) for k, text in enumerate(lines))
+            part / f"label_02/{name}.txt",
+            "".join(f"{i} {k} {text}\n" for i in range(2) for k, text in enumerate(lines)),
         )
         _write(part / f"oxts/{name}.txt", "".join(oxts_line(i) for i in range(3)))
         for i in range(3):

@@ -3,14 +3,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lcf3d.datasets.argoverse2 import (
-    Argoverse2Dataset,
-    detections_by_frame,
-    find_logs,
-    nearest,
-    results_of_frames,
-    split_id,
-)
+from lcf3d.datasets.argoverse2 import Argoverse2Dataset
+from lcf3d.datasets.argoverse2_frames import detections_by_frame, results_of_frames, split_id
+from lcf3d.datasets.argoverse2_log import find_logs, nearest
 from lcf3d.errors import DatasetError
 from lcf3d.formats.argoverse import ARGOVERSE_CLASSES
 from lcf3d.geometry.boxes import points_in_boxes

@@ -46,8 +46,8 @@ class ObjectShape:
 # KITTI: mean sizes of the training set as published with Frustum PointNets (Qi et al. 2018), rounded to 1 cm.
 # nuScenes: the anchor sizes used by detectors on it (CBGS, Zhu et al. 2019). The two data sets were annotated in
 # different countries and by different rules, so "Car" and "car" differ. Deviations: rounded from KITTI's training
-# labels; for classes that only nuScenes has, a tenth to a quarter of the size. Argoverse 2: as nuScenes where it has the
-# same kind of object, else what such things commonly measure.
+# labels; for classes that only nuScenes has, a tenth to a quarter of the size. Argoverse 2: as nuScenes where it has
+# the same kind of object, else what such things commonly measure.
 SHAPES: Mapping[str, ObjectShape] = MappingProxyType(
     {
         "Car": ObjectShape(3.88, 1.63, 1.53, 0.44, 0.11, 0.14),
