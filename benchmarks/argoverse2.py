@@ -21,17 +21,19 @@ from time import perf_counter
 import numpy as np
 
 from lcf3d import Detections2D, Detections3D, FusionConfig, LateCascadeFusion
-from lcf3d.datasets.argoverse2 import RING_CAMERAS, Argoverse2Dataset, detections_by_frame, results_of_frames
+from lcf3d.datasets.argoverse2 import RING_CAMERAS, Argoverse2Dataset
+from lcf3d.datasets.argoverse2_frames import detections_by_frame, results_of_frames
 from lcf3d.evaluation.argoverse import ArgoverseMetrics, evaluate_argoverse
-from lcf3d.formats.argoverse import ARGOVERSE_CLASSES, read_submission
+from lcf3d.formats.argoverse import read_submission
+from lcf3d.formats.coco import write_camera_detections
 from lcf3d.geometry.camera import depths_of, project_boxes, project_points
 from lcf3d.geometry.iou import iou_3d
-from lcf3d.provenance import Stage
-from lcf3d.structures import Camera, FloatArray, Frame
+from lcf3d.provenance import Outcome
+from lcf3d.structures import ARGOVERSE_CLASSES, Camera, FloatArray, Frame
 from lcf3d.visualization.png import draw_frame
 from lcf3d.visualization.scene import Scene
 
-CONFIG = FusionConfig.preset("default", class_names=ARGOVERSE_CLASSES)
+CONFIG = FusionConfig.preset("argoverse2")
 LEAST_HEIGHT_PX = 12
 HIDDEN_SHARE = 0.7
 SHOWN_CAMERAS = tuple(
@@ -106,7 +108,7 @@ def measure_recovery(frames: Sequence[Frame], cameras: Sequence[str], seed: int)
         fused = fusion(frame, Detections3D.empty(ARGOVERSE_CLASSES), camera)
         spent.append(perf_counter() - start)
         proposals += sum(int((found.scores > CONFIG.decisive_score).sum()) for found in camera.values())
-        boxes = fused.detections[np.array(fused.stages) == Stage.RECOVERED]
+        boxes = fused.detections[fused.outcomes == Outcome.RECOVERED]
         recovered += len(boxes)
         distances = np.linalg.norm(boxes.boxes[:, None, :2] - frame.labels.boxes[None, :, :2], axis=2)
         nearest = distances.argmin(axis=1)
@@ -153,6 +155,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("root", type=Path)
     parser.add_argument("--lidar", type=Path, required=True, help="detections in the submission form")
+    parser.add_argument("--camera-out", type=Path, help="where to write the simulated camera detections, as JSON")
     parser.add_argument("--picture", type=Path, help="where to draw one frame")
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
@@ -170,12 +173,14 @@ def main() -> None:
     )
 
     fusion, rng, fused = LateCascadeFusion(CONFIG), np.random.default_rng(arguments.seed), {}
-    scanned = []
+    scanned, cameras_found = [], {}
     for frame in dataset:
         if frame.labels is None:
             continue
         boxes = found.get(frame.id, Detections3D.empty(ARGOVERSE_CLASSES))
-        fused[frame.id] = fusion(frame, boxes, simulated_detections(frame, rng))
+        camera = simulated_detections(frame, rng)
+        cameras_found.update({(frame.id, name): seen for name, seen in camera.items()})
+        fused[frame.id] = fusion(frame, boxes, camera)
         if frame.points is not None:
             scanned.append(frame)
     after = evaluate_argoverse(truth, results_of_frames({id: result.detections for id, result in fused.items()}))
@@ -183,6 +188,8 @@ def main() -> None:
     if scanned:
         for title, cameras in (("ring_front_center", RING_CAMERAS[:1]), ("seven cameras", RING_CAMERAS)):
             print(f"recovery on {len(scanned)} sweeps, {title}: {measure_recovery(scanned, cameras, arguments.seed)}")
+    if arguments.camera_out:
+        write_camera_detections(arguments.camera_out, cameras_found)
     if arguments.picture:
         frame = scanned[0] if scanned else dataset[0]
         scene = Scene.from_fused(fused[frame.id], frame.labels)

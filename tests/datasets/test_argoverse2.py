@@ -7,9 +7,9 @@ from lcf3d.datasets.argoverse2 import Argoverse2Dataset
 from lcf3d.datasets.argoverse2_frames import detections_by_frame, results_of_frames, split_id
 from lcf3d.datasets.argoverse2_log import find_logs, nearest
 from lcf3d.errors import DatasetError
-from lcf3d.formats.argoverse import ARGOVERSE_CLASSES
 from lcf3d.geometry.boxes import points_in_boxes
 from lcf3d.geometry.camera import project_points
+from lcf3d.structures import ARGOVERSE_CLASSES
 from tests.datasets.argoverse_log import FIRST_NS, LOG, SPEED, STEP_NS, sweep_time, write_log
 
 pytest.importorskip("pyarrow", reason="needs pyarrow (extra formats)")

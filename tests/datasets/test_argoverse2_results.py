@@ -7,11 +7,11 @@ from lcf3d.datasets.argoverse2 import Argoverse2Dataset
 from lcf3d.datasets.argoverse2_results import ArgoverseWriter
 from lcf3d.datasets.opening import open_dataset
 from lcf3d.errors import DatasetError, FormatError
-from lcf3d.formats.argoverse import ARGOVERSE_CLASSES, read_submission
+from lcf3d.formats.argoverse import read_submission
 from lcf3d.formats.feather import write_columns
 from lcf3d.fusion.config import FusionConfig
 from lcf3d.fusion.pipeline import LateCascadeFusion
-from lcf3d.structures import Detections2D, Detections3D, Frame
+from lcf3d.structures import ARGOVERSE_CLASSES, Detections2D, Detections3D, Frame
 from tests.datasets.argoverse_log import (
     LOG,
     POSE,

@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 from lcf3d.errors import DatasetError, FormatError
 from lcf3d.evaluation.argoverse import OFFICIAL, ArgoverseMetrics, ArgoverseMetricsConfig, evaluate_argoverse
-from lcf3d.formats.argoverse import ARGOVERSE_CLASSES, Cuboids, read_annotations, read_submission
+from lcf3d.formats.argoverse import Cuboids, read_annotations, read_submission
+from lcf3d.structures import ARGOVERSE_CLASSES
 
 CAR, DOG = ARGOVERSE_CLASSES.index("REGULAR_VEHICLE"), ARGOVERSE_CLASSES.index("DOG")
 

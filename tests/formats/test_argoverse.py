@@ -5,7 +5,6 @@ import pytest
 
 from lcf3d.errors import FormatError
 from lcf3d.formats.argoverse import (
-    ARGOVERSE_CLASSES,
     Cuboids,
     read_annotations,
     read_calibration,
@@ -15,7 +14,7 @@ from lcf3d.formats.argoverse import (
     write_submission,
 )
 from lcf3d.formats.feather import write_columns
-from lcf3d.structures import Detections3D
+from lcf3d.structures import ARGOVERSE_CLASSES, Detections3D
 from tests.datasets.argoverse_log import (
     CUBOID,
     FIRST_NS,

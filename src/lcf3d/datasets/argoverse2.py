@@ -25,9 +25,9 @@ from lcf3d.datasets.base import BaseDataset, CameraSource, LidarSource, ResultWr
 from lcf3d.datasets.check import Finding
 from lcf3d.datasets.images import ImageFiles
 from lcf3d.errors import DatasetError
-from lcf3d.formats.argoverse import ARGOVERSE_CLASSES, Cuboids, read_sweep
+from lcf3d.formats.argoverse import Cuboids, read_sweep
 from lcf3d.geometry.rotation import invert_rigid
-from lcf3d.structures import Camera, FloatArray, Frame
+from lcf3d.structures import ARGOVERSE_CLASSES, Camera, FloatArray, Frame
 
 RING_CAMERAS = (
     "ring_front_center",
@@ -62,6 +62,7 @@ class Argoverse2Dataset(BaseDataset):
     camera_names = (*RING_CAMERAS, *STEREO_CAMERAS)
     used_cameras = RING_CAMERAS
     stereo_pair = STEREO_CAMERAS
+    preset = "argoverse2"
     evaluation = "lcf3d.evaluation.argoverse_task:ArgoverseEvaluation"
 
     def __init__(

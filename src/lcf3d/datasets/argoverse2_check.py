@@ -12,8 +12,8 @@ from lcf3d.datasets.argoverse2_frames import split_id
 from lcf3d.datasets.argoverse2_results import ArgoverseLidarResults, result_file
 from lcf3d.datasets.check import Finding, check_frames
 from lcf3d.errors import Lcf3dError
-from lcf3d.formats.argoverse import ARGOVERSE_CLASSES, read_submission
-from lcf3d.structures import Frame
+from lcf3d.formats.argoverse import read_submission
+from lcf3d.structures import ARGOVERSE_CLASSES, Frame
 
 if TYPE_CHECKING:
     from lcf3d.datasets.argoverse2 import Argoverse2Dataset

@@ -7,9 +7,9 @@ from pathlib import Path
 
 from lcf3d.datasets.argoverse2_frames import detections_by_frame, id_of, results_of_frames, split_id
 from lcf3d.errors import DatasetError
-from lcf3d.formats.argoverse import ARGOVERSE_CLASSES, read_submission, write_submission
+from lcf3d.formats.argoverse import read_submission, write_submission
 from lcf3d.provenance import FusedDetections
-from lcf3d.structures import Detections3D, Frame
+from lcf3d.structures import ARGOVERSE_CLASSES, Detections3D, Frame
 
 FILE_NAME = "results.feather"
 

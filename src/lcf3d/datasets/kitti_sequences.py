@@ -8,8 +8,8 @@ from pathlib import Path
 
 from lcf3d.datasets.base import require_folder
 from lcf3d.datasets.images import ImageFiles
-from lcf3d.datasets.kitti import PARTS, KittiLikeDataset, cameras_of, is_tracking, read_points
-from lcf3d.datasets.kitti_drives import Drive, TrackingDrive, odometry_drives, raw_drives, tracking_drives
+from lcf3d.datasets.kitti import PARTS, KittiCalibration, KittiLikeDataset, cameras_of, is_tracking, read_points
+from lcf3d.datasets.kitti_drives import Drive, odometry_drives, raw_drives, tracking_drives
 from lcf3d.errors import ConfigError, DatasetError
 from lcf3d.formats.kitti import read_frame_ids
 from lcf3d.structures import KITTI_CLASSES, Frame
@@ -92,6 +92,10 @@ class KittiSequences(KittiLikeDataset):
             raise ConfigError(f"{self.root} has no frame {frame_id!r}; its first is {self.ids[0]!r}")
         return self._places[frame_id]
 
+    def calibration(self, frame_id: str) -> KittiCalibration:
+        """The calibration of a frame."""
+        return self.place(frame_id)[0].calibration
+
     def image_paths(self, frame_id: str) -> dict[str, Path]:
         """The image files of a frame that are there, by camera name."""
         drive, number = self.place(frame_id)
@@ -161,7 +165,7 @@ class KittiTrackingDataset(KittiSequences):
     """
 
     layout = "KITTI's tracking benchmark (training/calib/SEQUENCE.txt)"
-    evaluation = "lcf3d.evaluation.kitti_task:KittiEvaluation"
+    evaluation = "lcf3d.evaluation.kitti_task:KittiTrackingEvaluation"
 
     def __init__(
         self,
@@ -210,10 +214,3 @@ class KittiOdometryDataset(KittiSequences):
     def recognizes(root: Path) -> bool:
         """Whether a folder looks like this layout."""
         return any(True for _ in (root / "sequences").glob("*/calib.txt"))
-
-
-def tracking_objects(dataset: KittiTrackingDataset, frame_id: str) -> object:
-    """Labels of a frame of the tracking benchmark as the object benchmark writes them."""
-    drive, number = dataset.place(frame_id)
-    assert isinstance(drive, TrackingDrive)
-    return drive.objects(number)

@@ -15,8 +15,8 @@ import numpy as np
 
 from lcf3d.errors import DatasetError, FormatError
 from lcf3d.evaluation.center_distance import RECALLS, heading_errors
-from lcf3d.formats.argoverse import ARGOVERSE_CLASSES, Cuboids
-from lcf3d.structures import BoolArray, FloatArray, IntArray
+from lcf3d.formats.argoverse import Cuboids
+from lcf3d.structures import ARGOVERSE_CLASSES, BoolArray, FloatArray, IntArray
 
 ERRORS = ("ATE", "ASE", "AOE")
 """True-positive errors: metres, 1 - IoU of the sides laid into one another, radians."""

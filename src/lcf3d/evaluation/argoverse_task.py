@@ -17,8 +17,8 @@ from lcf3d.evaluation.argoverse import OFFICIAL, ArgoverseMetrics, evaluate_argo
 from lcf3d.evaluation.distance import DistanceEvaluation, DistanceResultSet
 from lcf3d.evaluation.distance_study import DistanceResults
 from lcf3d.evaluation.protocol import EvaluationOptions, TableData, refuse_options
-from lcf3d.formats.argoverse import ARGOVERSE_CLASSES, Cuboids, read_submission
-from lcf3d.structures import BoolArray, Detections3D
+from lcf3d.formats.argoverse import Cuboids, read_submission
+from lcf3d.structures import ARGOVERSE_CLASSES, BoolArray, Detections3D
 
 
 class ArgoverseEvaluation(DistanceEvaluation):

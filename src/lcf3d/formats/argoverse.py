@@ -18,37 +18,7 @@ from numpy.typing import NDArray
 from lcf3d.errors import FormatError
 from lcf3d.formats.feather import TEXT, read_columns, write_columns
 from lcf3d.geometry.rotation import quaternions_from_yaws, rigid_transforms, yaws_from_quaternions
-from lcf3d.structures import Detections3D, FloatArray, IntArray
-
-ARGOVERSE_CLASSES = (
-    "ARTICULATED_BUS",
-    "BICYCLE",
-    "BICYCLIST",
-    "BOLLARD",
-    "BOX_TRUCK",
-    "BUS",
-    "CONSTRUCTION_BARREL",
-    "CONSTRUCTION_CONE",
-    "DOG",
-    "LARGE_VEHICLE",
-    "MESSAGE_BOARD_TRAILER",
-    "MOBILE_PEDESTRIAN_CROSSING_SIGN",
-    "MOTORCYCLE",
-    "MOTORCYCLIST",
-    "PEDESTRIAN",
-    "REGULAR_VEHICLE",
-    "SCHOOL_BUS",
-    "SIGN",
-    "STOP_SIGN",
-    "STROLLER",
-    "TRUCK",
-    "TRUCK_CAB",
-    "VEHICULAR_TRAILER",
-    "WHEELCHAIR",
-    "WHEELED_DEVICE",
-    "WHEELED_RIDER",
-)
-"""The 26 categories that the detection benchmark evaluates."""
+from lcf3d.structures import ARGOVERSE_CLASSES, Detections3D, FloatArray, IntArray
 
 OTHER_CLASSES = ("ANIMAL", "OFFICIAL_SIGNALER", "RAILED_VEHICLE", "TRAFFIC_LIGHT_TRAILER")
 """Categories that are annotated but not evaluated; their cuboids are left out and counted."""
