@@ -13,6 +13,7 @@ from lcf3d.fusion.config import FusionConfig
 from lcf3d.fusion.pipeline import LateCascadeFusion
 from lcf3d.structures import ARGOVERSE_CLASSES, Detections2D, Detections3D, Frame
 from tests.datasets.argoverse_log import (
+    CUBOID,
     LOG,
     POSE,
     cuboid,
@@ -107,10 +108,15 @@ def test_what_is_wrong_with_a_log(dataset: Argoverse2Dataset, tmp_path: Path) ->
     )
     findings = check(Argoverse2Dataset(tmp_path))
     assert ("ARG03", f"log {LOG} has no ego pose for 2 of 3 frames") in findings
-    (folder / "annotations.feather").write_text("nothing")
+    columns = rows(CUBOID, [cuboid(sweep_time(1), "DOG", (1, 2, 3))])
+    del columns["tz_m"]
+    write_columns(folder / "annotations.feather", columns)
     findings = check(Argoverse2Dataset(tmp_path))
     assert findings[0][0] == "ARG01"
-    assert "annotations.feather cannot be read as a feather file" in findings[0][1]
+    assert "annotations.feather has no column tz_m" in findings[0][1]
+    (folder / "annotations.feather").write_text("nothing")
+    with pytest.raises(FormatError, match=r"annotations\.feather cannot be read as a feather file"):
+        Argoverse2Dataset(tmp_path)
 
 
 def test_what_is_wrong_with_results(dataset: Argoverse2Dataset, tmp_path: Path) -> None:

@@ -14,7 +14,6 @@ camera's ``camera_from_lidar`` leads through the ego poses at both times, since 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -56,11 +55,12 @@ class Argoverse2Dataset(BaseDataset):
 
     Raises:
         DatasetError: no such log is there.
+        FormatError: the annotations of a log are no feather file.
     """
 
     class_names = ARGOVERSE_CLASSES
-    camera_names = (*RING_CAMERAS, *STEREO_CAMERAS)
-    used_cameras = RING_CAMERAS
+    camera_names: tuple[str, ...] = (*RING_CAMERAS, *STEREO_CAMERAS)
+    used_cameras: tuple[str, ...] = RING_CAMERAS
     stereo_pair = STEREO_CAMERAS
     preset = "argoverse2"
     evaluation = "lcf3d.evaluation.argoverse_task:ArgoverseEvaluation"
@@ -89,12 +89,9 @@ class Argoverse2Dataset(BaseDataset):
             )
         self._folders = {folder.name: folder for folder in chosen}
         self.log_ids = tuple(self._folders)
+        # log by log in order of time
+        self.ids = tuple(id_of(folder.name, int(time)) for folder in chosen for time in Argoverse2Log(folder).times())
         self._open = Argoverse2Log(chosen[0])
-
-    @cached_property
-    def ids(self) -> tuple[str, ...]:  # type: ignore[override]
-        """Frame ids, log by log in order of time."""
-        return tuple(id_of(log, int(t)) for log in self.log_ids for t in Argoverse2Log(self._folders[log]).times())
 
     @staticmethod
     def recognizes(root: Path) -> bool:

@@ -4,19 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 
-from lcf3d.datasets.argoverse2_frames import split_id
+from lcf3d.datasets.argoverse2_frames import id_of, split_id
+from lcf3d.datasets.argoverse2_log import Argoverse2Log
 from lcf3d.datasets.argoverse2_results import ArgoverseLidarResults, result_file
 from lcf3d.datasets.check import Finding, check_frames
 from lcf3d.errors import Lcf3dError
 from lcf3d.formats.argoverse import read_submission
 from lcf3d.structures import ARGOVERSE_CLASSES, Frame
-
-if TYPE_CHECKING:
-    from lcf3d.datasets.argoverse2 import Argoverse2Dataset
 
 RULES = {
     "ARG01": "calibration, poses and annotations of every log can be read",
@@ -28,10 +26,25 @@ RULES = {
 }
 
 
+class ArgoverseLogs(Protocol):
+    """What the rules ask of an Argoverse 2 dataset."""
+
+    log_ids: tuple[str, ...]
+    camera_names: tuple[str, ...]
+
+    def log(self, log_id: str) -> Argoverse2Log:
+        """The log of that id."""
+        ...
+
+    def frame(self, frame_id: str) -> Frame:
+        """The frame of that id."""
+        ...
+
+
 class _Readable:
     """The frames of the logs that can be read."""
 
-    def __init__(self, dataset: Argoverse2Dataset, ids: tuple[str, ...]) -> None:
+    def __init__(self, dataset: ArgoverseLogs, ids: tuple[str, ...]) -> None:
         self.ids = ids
         self._dataset = dataset
 
@@ -41,7 +54,7 @@ class _Readable:
 
 
 def check_argoverse2(
-    dataset: Argoverse2Dataset, results: Path | None = None, progress: Callable[[], None] = lambda: None
+    dataset: ArgoverseLogs, results: Path | None = None, progress: Callable[[], None] = lambda: None
 ) -> list[Finding]:
     """Everything that `RULES` find wrong, then the rules of every dataset on the logs that can be read.
 
@@ -71,7 +84,7 @@ def check_argoverse2(
         if lacking:
             count = f"{len(lacking)} of {len(annotated)} annotated moments have no sweep, first {lacking[0]}"
             findings.append(Finding("ARG04", "warning", f"log {log_id}: {count}"))
-        ids += [f"{log_id}_{time}" for time in placed]
+        ids += [id_of(log_id, time) for time in placed]
     if results is not None:
         findings += _check_results(tuple(ids), results)
     return findings + check_frames(_Readable(dataset, tuple(ids)), progress=progress)

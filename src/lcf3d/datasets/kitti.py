@@ -6,6 +6,7 @@ Any subset of the sensor folders may be there. Camera ``left`` is the left colou
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -150,7 +151,82 @@ def _check_image_size(path: Path, size: tuple[int, int], projection: FloatArray)
             )
 
 
-class KittiDataset(BaseDataset):
+def cameras_of(
+    calibration: KittiCalibration,
+    images: Mapping[str, Path],
+    sizes: Mapping[str, tuple[int, int]],
+    default_size: tuple[int, int] = DEFAULT_IMAGE_SIZE,
+) -> list[Camera]:
+    """The colour cameras that a calibration describes.
+
+    Args:
+        calibration: of the frame.
+        images: image files by camera name, of which the size is taken.
+        sizes: (width, height) by name of cameras without an image; KITTI's own are known.
+        default_size: of all others.
+
+    Raises:
+        FormatError: an image that its calibration does not fit.
+    """
+    cameras = []
+    for name, _, key in CAMERAS:
+        if key not in calibration.projections:
+            continue
+        matrix = calibration.projections[key]
+        if name in images:
+            size = image_size(images[name])
+            _check_image_size(images[name], size, matrix)
+        else:
+            size = sizes.get(name) or IMAGE_SIZES.get(round(float(matrix[0, 0]), 4), default_size)
+        cameras.append(Camera(name, matrix, calibration.camera_from_lidar, *size))
+    return cameras
+
+
+def is_tracking(root: Path) -> bool:
+    """Whether a folder has the layout of the tracking benchmark, which also begins with ``training``."""
+    return any(
+        any(path.is_dir() for path in (root / part / folder).glob("*"))
+        for part in PARTS
+        for folder in ("image_02", "image_03", "velodyne")
+    ) or any((root / part / "label_02").is_dir() and not (root / part / "label_2").is_dir() for part in PARTS)
+
+
+class KittiLikeDataset(BaseDataset):
+    """What KITTI's layouts have in common: the cameras, and results as text files, one a frame."""
+
+    camera_names = tuple(name for name, _, _ in CAMERAS)
+    used_cameras = ("left",)
+    stereo_pair = ("left", "right")
+    preset = "kitti"
+
+    @abstractmethod
+    def image_paths(self, frame_id: str) -> dict[str, Path]:
+        """The image files of a frame that are there, by camera name."""
+
+    def has_image(self, frame_id: str, camera: str) -> bool:
+        """Whether there is an image, without reading it."""
+        return camera in self.image_paths(frame_id)
+
+    def lidar_results(self, path: Path, class_names: Sequence[str], missing: str = "error") -> LidarSource:
+        """3D detections of KITTI result files."""
+        from lcf3d.datasets.kitti_results import KittiLidarResults
+
+        return KittiLidarResults(path, class_names, missing)
+
+    def camera_results(self, path: Path, class_names: Sequence[str], missing: str = "error") -> CameraSource:
+        """2D detections of KITTI result files."""
+        from lcf3d.datasets.kitti_results import KittiCameraResults
+
+        return KittiCameraResults(path, class_names, missing)
+
+    def writer(self, folder: Path) -> ResultWriter:
+        """A KITTI result file a frame."""
+        from lcf3d.datasets.kitti_results import KittiWriter
+
+        return KittiWriter(folder)
+
+
+class KittiDataset(KittiLikeDataset):
     """Frames of a KITTI-layout folder.
 
     Args:
@@ -165,10 +241,6 @@ class KittiDataset(BaseDataset):
         DatasetError: the folder or the split does not exist.
     """
 
-    camera_names = tuple(name for name, _, _ in CAMERAS)
-    used_cameras = ("left",)
-    stereo_pair = ("left", "right")
-    preset = "kitti"
     evaluation = "lcf3d.evaluation.kitti_task:KittiEvaluation"
 
     def __init__(
@@ -197,7 +269,7 @@ class KittiDataset(BaseDataset):
     @staticmethod
     def recognizes(root: Path) -> bool:
         """Whether a folder looks like this layout."""
-        return any((root / part).is_dir() for part in PARTS)
+        return any((root / part).is_dir() for part in PARTS) and not is_tracking(root)
 
     def _part_of(self, listed: Sequence[str]) -> str:
         """The part that holds the frames of a split."""
@@ -251,28 +323,6 @@ class KittiDataset(BaseDataset):
         found = {name: self._present[folder].get(frame_id) for name, folder, _ in CAMERAS}
         return {name: path for name, path in found.items() if path is not None}
 
-    def has_image(self, frame_id: str, camera: str) -> bool:
-        """Whether there is an image, without reading it."""
-        return camera in self.image_paths(frame_id)
-
-    def lidar_results(self, path: Path, class_names: Sequence[str], missing: str = "error") -> LidarSource:
-        """3D detections of KITTI result files."""
-        from lcf3d.datasets.kitti_results import KittiLidarResults
-
-        return KittiLidarResults(path, class_names, missing)
-
-    def camera_results(self, path: Path, class_names: Sequence[str], missing: str = "error") -> CameraSource:
-        """2D detections of KITTI result files."""
-        from lcf3d.datasets.kitti_results import KittiCameraResults
-
-        return KittiCameraResults(path, class_names, missing)
-
-    def writer(self, folder: Path) -> ResultWriter:
-        """A KITTI result file a frame."""
-        from lcf3d.datasets.kitti_results import KittiWriter
-
-        return KittiWriter(folder)
-
     def check(self, results: Path | None = None, progress: Callable[[], None] = lambda: None) -> list[Finding]:
         """The rules ``KIT``."""
         from lcf3d.datasets.kitti_check import check_kitti
@@ -287,18 +337,7 @@ class KittiDataset(BaseDataset):
             FormatError: its calibration is malformed.
         """
         calibration = self.calibration(frame_id)
-        cameras, images = [], self.image_paths(frame_id)
-        for name, _, projection in CAMERAS:
-            if projection not in calibration.projections:
-                continue
-            path = images.get(name)
-            matrix = calibration.projections[projection]
-            if path:
-                width, height = image_size(path)
-                _check_image_size(path, (width, height), matrix)
-            else:
-                width, height = IMAGE_SIZES.get(round(float(matrix[0, 0]), 4), self.default_image_size)
-            cameras.append(Camera(name, matrix, calibration.camera_from_lidar, width, height))
+        images = self.image_paths(frame_id)
         scan, label = self._present["velodyne"].get(frame_id), self._present["label_2"].get(frame_id)
 
         def labels() -> Detections3D:
@@ -308,7 +347,7 @@ class KittiDataset(BaseDataset):
         return Frame(
             frame_id,
             points=(lambda: read_points(scan)) if scan else None,
-            cameras=cameras,
+            cameras=cameras_of(calibration, images, {}, self.default_image_size),
             images=ImageFiles(images),
             labels=labels if label else None,
         )

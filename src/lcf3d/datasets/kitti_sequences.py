@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from pathlib import Path
 
 from lcf3d.datasets.base import require_folder
+from lcf3d.datasets.check import Finding, check_frames
 from lcf3d.datasets.images import ImageFiles
 from lcf3d.datasets.kitti import PARTS, KittiCalibration, KittiLikeDataset, cameras_of, is_tracking, read_points
+from lcf3d.datasets.kitti_check import check_results
 from lcf3d.datasets.kitti_drives import Drive, odometry_drives, raw_drives, tracking_drives
 from lcf3d.errors import ConfigError, DatasetError
 from lcf3d.formats.kitti import read_frame_ids
@@ -55,6 +57,8 @@ class KittiSequences(KittiLikeDataset):
                 raise DatasetError(f"{root} has no sequence {sequence!r} among its {len(drives)}: {first} ...")
             self.drives = {name: self.drives[name] for name in chosen}
         self._listed = None if split is None else set(read_frame_ids(self._split_path(split)))
+        # sequence by sequence in order of time
+        self.ids = tuple(self._places)
         if self._listed is not None and not self.ids:
             raise DatasetError(f"{self._split_path(split or '')} names no sequence and no frame that is there")
 
@@ -77,11 +81,6 @@ class KittiSequences(KittiLikeDataset):
                     found[frame_id] = drive, number
         return found
 
-    @cached_property
-    def ids(self) -> tuple[str, ...]:  # type: ignore[override]
-        """Frame ids, sequence by sequence in order of time."""
-        return tuple(self._places)
-
     def place(self, frame_id: str) -> tuple[Drive, int]:
         """Drive and number of a frame.
 
@@ -100,6 +99,11 @@ class KittiSequences(KittiLikeDataset):
         """The image files of a frame that are there, by camera name."""
         drive, number = self.place(frame_id)
         return {name: paths[number] for name, paths in drive.images.items() if number in paths}
+
+    def check(self, results: Path | None = None, progress: Callable[[], None] = lambda: None) -> list[Finding]:
+        """The rules of every dataset, and those of KITTI result files."""
+        findings = check_frames(self, progress=progress)
+        return findings if results is None else [*findings, *check_results(self.ids, results)]
 
     def frame(self, frame_id: str) -> Frame:
         """The frame of that id; scan, images and labels are read when first asked for.
