@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from lcf3d.datasets.kitti import KittiDataset
-from lcf3d.datasets.kitti_sequences import KittiOdometryDataset, KittiRawDataset, KittiSequences, KittiTrackingDataset
+from lcf3d.datasets.kitti_layouts import KittiOdometryDataset, KittiRawDataset, KittiSequences, KittiTrackingDataset
 from lcf3d.datasets.opening import open_dataset
 from lcf3d.errors import ConfigError, DatasetError, FormatError
 from lcf3d.formats.kitti_drives import EARTH_RADIUS_M
