@@ -7,7 +7,7 @@
     ROOT/SPLIT/LOG/sensors/cameras/NAME/TIME.jpg    images, undistorted
 
 A frame is a moment with a sweep or with annotations; its id is ``LOG_TIME`` with the time in nanoseconds. Its LiDAR
-frame is the egovehicle frame at that time: x forward, y left, z up, origin on the ground side of the rear axle. Each
+frame is the egovehicle frame at that time: x forward, y left, z up, origin at the middle of the rear axle. Each
 camera's ``camera_from_lidar`` leads through the ego poses at both times, since images are not taken with the sweeps.
 """
 
