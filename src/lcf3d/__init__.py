@@ -7,7 +7,16 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
 from lcf3d.errors import Lcf3dError
-from lcf3d.structures import KITTI_CLASSES, NUSCENES_CLASSES, Camera, Detections2D, Detections3D, Frame, InstanceMask
+from lcf3d.structures import (
+    ARGOVERSE_CLASSES,
+    KITTI_CLASSES,
+    NUSCENES_CLASSES,
+    Camera,
+    Detections2D,
+    Detections3D,
+    Frame,
+    InstanceMask,
+)
 
 if TYPE_CHECKING:
     from lcf3d.api import draw, evaluate, read_run, run
@@ -68,6 +77,7 @@ _LAZY = {
 }
 
 __all__ = [
+    "ARGOVERSE_CLASSES",
     "KITTI_CLASSES",
     "NUSCENES_CLASSES",
     "BaseDataset",
