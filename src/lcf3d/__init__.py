@@ -8,7 +8,16 @@ from typing import TYPE_CHECKING, Any
 
 from lcf3d.distortion import Distortion
 from lcf3d.errors import Lcf3dError
-from lcf3d.structures import KITTI_CLASSES, NUSCENES_CLASSES, Camera, Detections2D, Detections3D, Frame, InstanceMask
+from lcf3d.structures import (
+    ARGOVERSE_CLASSES,
+    KITTI_CLASSES,
+    NUSCENES_CLASSES,
+    Camera,
+    Detections2D,
+    Detections3D,
+    Frame,
+    InstanceMask,
+)
 
 if TYPE_CHECKING:
     from lcf3d.api import draw, evaluate, read_run, run
@@ -69,6 +78,7 @@ _LAZY = {
 }
 
 __all__ = [
+    "ARGOVERSE_CLASSES",
     "KITTI_CLASSES",
     "NUSCENES_CLASSES",
     "BaseDataset",

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from lcf3d.detectors.classes import COCO_CLASSES, class_mapping, join_riders, to_classes
-from lcf3d.structures import KITTI_CLASSES, NUSCENES_CLASSES, Detections2D, InstanceMask
+from lcf3d.structures import ARGOVERSE_CLASSES, KITTI_CLASSES, NUSCENES_CLASSES, Detections2D, InstanceMask
 
 PERSON = ("person", 0.8, (10, 0, 30, 60))
 BICYCLE = ("bicycle", 0.45, (0, 30, 40, 70))
@@ -56,6 +56,24 @@ def test_mappings_by_name() -> None:
         "Cyclist": "bicycle",
         "Van": "car",
     }
+
+
+def test_the_names_of_argoverse() -> None:
+    coco_names = class_mapping(COCO_CLASSES, ARGOVERSE_CLASSES)
+    assert {name: coco_names[name] for name in ("person", "car", "truck", "bus", "stop sign", "dog", "bicycle")} == {
+        "person": "PEDESTRIAN",
+        "car": "REGULAR_VEHICLE",
+        "truck": "TRUCK",
+        "bus": "BUS",
+        "stop sign": "STOP_SIGN",
+        "dog": "DOG",
+        "bicycle": "BICYCLE",
+    }
+    assert class_mapping(KITTI_CLASSES, ARGOVERSE_CLASSES)["Cyclist"] == "BICYCLIST"
+    nuscenes = class_mapping(NUSCENES_CLASSES, ARGOVERSE_CLASSES)
+    assert set(NUSCENES_CLASSES) - set(nuscenes) == {"construction_vehicle", "barrier"}
+    back = class_mapping(ARGOVERSE_CLASSES, NUSCENES_CLASSES)
+    assert (back["REGULAR_VEHICLE"], back["BOX_TRUCK"], back["VEHICULAR_TRAILER"]) == ("car", "truck", "trailer")
 
 
 def test_a_rider_and_a_bicycle_become_one_cyclist() -> None:

@@ -9,7 +9,9 @@ import typer
 
 
 def config(
-    preset: Annotated[str, typer.Argument(help="preset (default, paper, kitti, nuscenes) or a YAML file")] = "default",
+    preset: Annotated[
+        str, typer.Argument(help="preset (default, paper, kitti, nuscenes, argoverse2) or a YAML file")
+    ] = "default",
     set_: Annotated[list[str] | None, typer.Option("--set", help="change a setting, name=value; repeatable")] = None,
     stereo: Annotated[bool, typer.Option("--stereo", help="with the settings of stereo pairs")] = False,
     out: Annotated[Path | None, typer.Option(help="write to this file instead of the screen")] = None,

@@ -102,7 +102,7 @@ def _frames_of_run(results: Path, split: str | None) -> tuple[str | None, tuple[
 
 def run_folder(results: Path) -> Path:
     """The folder above ``data``, where provenance and settings of a run lie."""
-    return results.parent if results.name in ("data", "results.json") else results
+    return results.parent if results.name in ("data", "results.json", "results.feather") else results
 
 
 def result_names(results: Sequence[Path]) -> list[str]:

@@ -6,6 +6,7 @@ Any subset of the sensor folders may be there. Camera ``left`` is the left colou
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -42,18 +43,47 @@ class KittiCalibration:
     Attributes:
         projections: (3, 4) by name ``P0`` to ``P3``, pixels from the rectified reference camera.
         camera_from_lidar: (4, 4) rectified reference camera from Velodyne, ``R0_rect @ Tr_velo_to_cam``.
+        lidar_from_imu: (4, 4) Velodyne from the GPS/IMU unit, or None where the file does not say.
     """
 
     projections: Mapping[str, FloatArray]
     camera_from_lidar: FloatArray
+    lidar_from_imu: FloatArray | None = None
 
 
 def read_calibration(path: Path) -> KittiCalibration:
-    """Read a calibration file; spellings of the object and of the tracking benchmark are understood.
+    """Read a calibration file; spellings of the object, tracking and odometry benchmarks are understood.
 
     Raises:
         DatasetError: the file does not exist.
         FormatError: an entry is missing or malformed; names it.
+    """
+    entries = read_entries(path)
+    rectification, reference_from_lidar = np.eye(4), np.eye(4)
+    if "Tr" in entries:
+        # odometry: from the Velodyne to the rectified reference camera at once
+        reference_from_lidar[:3] = matrix_entry(path, entries, ("Tr",), (3, 4))
+    else:
+        rectification[:3, :3] = matrix_entry(path, entries, ("R0_rect", "R_rect"), (3, 3))
+        reference_from_lidar[:3] = matrix_entry(path, entries, ("Tr_velo_to_cam", "Tr_velo_cam"), (3, 4))
+    projections: dict[str, FloatArray] = {"P2": matrix_entry(path, entries, ("P2",), (3, 4))}
+    others: tuple[str, ...] = ("P0", "P1", "P3")
+    for name in others:
+        if name in entries:
+            projections[name] = matrix_entry(path, entries, (name,), (3, 4))
+    lidar_from_imu = None
+    if "Tr_imu_to_velo" in entries or "Tr_imu_velo" in entries:
+        lidar_from_imu = np.eye(4)
+        lidar_from_imu[:3] = matrix_entry(path, entries, ("Tr_imu_to_velo", "Tr_imu_velo"), (3, 4))
+    return KittiCalibration(projections, rectification @ reference_from_lidar, lidar_from_imu)
+
+
+def read_entries(path: Path, skip: Sequence[str] = ()) -> dict[str, FloatArray]:
+    """The numbers of a calibration file by the name that begins each line, but for the names in ``skip``.
+
+    Raises:
+        DatasetError: the file does not exist.
+        FormatError: a line is malformed; names it.
     """
     try:
         text = path.read_text(encoding="utf-8")
@@ -64,25 +94,25 @@ def read_calibration(path: Path) -> KittiCalibration:
     entries: dict[str, FloatArray] = {}
     for number, line in enumerate(text.splitlines(), 1):
         name, *fields = line.replace(":", " ").split() or [""]
+        if name in skip:
+            continue
         try:
             entries[name] = np.array([float(f) for f in fields])
         except ValueError:
             raise FormatError(f"{path}:{number}: {name} must be followed by numbers") from None
         if not np.isfinite(entries[name]).all():
             raise FormatError(f"{path}:{number}: {name} holds NaN or infinite values")
-    rectification = np.eye(4)
-    rectification[:3, :3] = _matrix(path, entries, ("R0_rect", "R_rect"), (3, 3))
-    reference_from_lidar = np.eye(4)
-    reference_from_lidar[:3] = _matrix(path, entries, ("Tr_velo_to_cam", "Tr_velo_cam"), (3, 4))
-    projections: dict[str, FloatArray] = {"P2": _matrix(path, entries, ("P2",), (3, 4))}
-    others: tuple[str, ...] = ("P0", "P1", "P3")
-    for name in others:
-        if name in entries:
-            projections[name] = _matrix(path, entries, (name,), (3, 4))
-    return KittiCalibration(projections, rectification @ reference_from_lidar)
+    return entries
 
 
-def _matrix(path: Path, entries: Mapping[str, FloatArray], names: Sequence[str], shape: tuple[int, int]) -> FloatArray:
+def matrix_entry(
+    path: Path, entries: Mapping[str, FloatArray], names: Sequence[str], shape: tuple[int, int]
+) -> FloatArray:
+    """The matrix under the first of ``names`` that the file at ``path`` has.
+
+    Raises:
+        FormatError: it has none of them, or of another size.
+    """
     for name in names:
         if name in entries:
             if entries[name].size != shape[0] * shape[1]:
@@ -121,7 +151,82 @@ def _check_image_size(path: Path, size: tuple[int, int], projection: FloatArray)
             )
 
 
-class KittiDataset(BaseDataset):
+def cameras_of(
+    calibration: KittiCalibration,
+    images: Mapping[str, Path],
+    sizes: Mapping[str, tuple[int, int]],
+    default_size: tuple[int, int] = DEFAULT_IMAGE_SIZE,
+) -> list[Camera]:
+    """The colour cameras that a calibration describes.
+
+    Args:
+        calibration: of the frame.
+        images: image files by camera name, of which the size is taken.
+        sizes: (width, height) by name of cameras without an image; KITTI's own are known.
+        default_size: of all others.
+
+    Raises:
+        FormatError: an image that its calibration does not fit.
+    """
+    cameras = []
+    for name, _, key in CAMERAS:
+        if key not in calibration.projections:
+            continue
+        matrix = calibration.projections[key]
+        if name in images:
+            size = image_size(images[name])
+            _check_image_size(images[name], size, matrix)
+        else:
+            size = sizes.get(name) or IMAGE_SIZES.get(round(float(matrix[0, 0]), 4), default_size)
+        cameras.append(Camera(name, matrix, calibration.camera_from_lidar, *size))
+    return cameras
+
+
+def is_tracking(root: Path) -> bool:
+    """Whether a folder has the layout of the tracking benchmark, which also begins with ``training``."""
+    return any(
+        any(path.is_dir() for path in (root / part / folder).glob("*"))
+        for part in PARTS
+        for folder in ("image_02", "image_03", "velodyne")
+    ) or any((root / part / "label_02").is_dir() and not (root / part / "label_2").is_dir() for part in PARTS)
+
+
+class KittiLikeDataset(BaseDataset):
+    """What KITTI's layouts have in common: the cameras, and results as text files, one a frame."""
+
+    camera_names = tuple(name for name, _, _ in CAMERAS)
+    used_cameras = ("left",)
+    stereo_pair = ("left", "right")
+    preset = "kitti"
+
+    @abstractmethod
+    def image_paths(self, frame_id: str) -> dict[str, Path]:
+        """The image files of a frame that are there, by camera name."""
+
+    def has_image(self, frame_id: str, camera: str) -> bool:
+        """Whether there is an image, without reading it."""
+        return camera in self.image_paths(frame_id)
+
+    def lidar_results(self, path: Path, class_names: Sequence[str], missing: str = "error") -> LidarSource:
+        """3D detections of KITTI result files."""
+        from lcf3d.datasets.kitti_results import KittiLidarResults
+
+        return KittiLidarResults(path, class_names, missing)
+
+    def camera_results(self, path: Path, class_names: Sequence[str], missing: str = "error") -> CameraSource:
+        """2D detections of KITTI result files."""
+        from lcf3d.datasets.kitti_results import KittiCameraResults
+
+        return KittiCameraResults(path, class_names, missing)
+
+    def writer(self, folder: Path) -> ResultWriter:
+        """A KITTI result file a frame."""
+        from lcf3d.datasets.kitti_results import KittiWriter
+
+        return KittiWriter(folder)
+
+
+class KittiDataset(KittiLikeDataset):
     """Frames of a KITTI-layout folder.
 
     Args:
@@ -136,10 +241,6 @@ class KittiDataset(BaseDataset):
         DatasetError: the folder or the split does not exist.
     """
 
-    camera_names = tuple(name for name, _, _ in CAMERAS)
-    used_cameras = ("left",)
-    stereo_pair = ("left", "right")
-    preset = "kitti"
     evaluation = "lcf3d.evaluation.kitti_task:KittiEvaluation"
 
     def __init__(
@@ -168,7 +269,7 @@ class KittiDataset(BaseDataset):
     @staticmethod
     def recognizes(root: Path) -> bool:
         """Whether a folder looks like this layout."""
-        return any((root / part).is_dir() for part in PARTS)
+        return any((root / part).is_dir() for part in PARTS) and not is_tracking(root)
 
     def _part_of(self, listed: Sequence[str]) -> str:
         """The part that holds the frames of a split."""
@@ -222,28 +323,6 @@ class KittiDataset(BaseDataset):
         found = {name: self._present[folder].get(frame_id) for name, folder, _ in CAMERAS}
         return {name: path for name, path in found.items() if path is not None}
 
-    def has_image(self, frame_id: str, camera: str) -> bool:
-        """Whether there is an image, without reading it."""
-        return camera in self.image_paths(frame_id)
-
-    def lidar_results(self, path: Path, class_names: Sequence[str], missing: str = "error") -> LidarSource:
-        """3D detections of KITTI result files."""
-        from lcf3d.datasets.kitti_results import KittiLidarResults
-
-        return KittiLidarResults(path, class_names, missing)
-
-    def camera_results(self, path: Path, class_names: Sequence[str], missing: str = "error") -> CameraSource:
-        """2D detections of KITTI result files."""
-        from lcf3d.datasets.kitti_results import KittiCameraResults
-
-        return KittiCameraResults(path, class_names, missing)
-
-    def writer(self, folder: Path) -> ResultWriter:
-        """A KITTI result file a frame."""
-        from lcf3d.datasets.kitti_results import KittiWriter
-
-        return KittiWriter(folder)
-
     def check(self, results: Path | None = None, progress: Callable[[], None] = lambda: None) -> list[Finding]:
         """The rules ``KIT``."""
         from lcf3d.datasets.kitti_check import check_kitti
@@ -258,18 +337,7 @@ class KittiDataset(BaseDataset):
             FormatError: its calibration is malformed.
         """
         calibration = self.calibration(frame_id)
-        cameras, images = [], self.image_paths(frame_id)
-        for name, _, projection in CAMERAS:
-            if projection not in calibration.projections:
-                continue
-            path = images.get(name)
-            matrix = calibration.projections[projection]
-            if path:
-                width, height = image_size(path)
-                _check_image_size(path, (width, height), matrix)
-            else:
-                width, height = IMAGE_SIZES.get(round(float(matrix[0, 0]), 4), self.default_image_size)
-            cameras.append(Camera(name, matrix, calibration.camera_from_lidar, width, height))
+        images = self.image_paths(frame_id)
         scan, label = self._present["velodyne"].get(frame_id), self._present["label_2"].get(frame_id)
 
         def labels() -> Detections3D:
@@ -279,7 +347,7 @@ class KittiDataset(BaseDataset):
         return Frame(
             frame_id,
             points=(lambda: read_points(scan)) if scan else None,
-            cameras=cameras,
+            cameras=cameras_of(calibration, images, {}, self.default_image_size),
             images=ImageFiles(images),
             labels=labels if label else None,
         )

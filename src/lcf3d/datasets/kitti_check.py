@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Protocol
 
@@ -93,7 +93,7 @@ def check_kitti(
                 Finding("KIT08", "warning", f"{len(frame_ids)} of {len(dataset)} frames have no {what}, {first}")
             )
     if results is not None:
-        findings += _check_results(dataset, results)
+        findings += check_results(dataset.ids, results)
     return findings
 
 
@@ -187,17 +187,17 @@ def _clear(objects: KittiObjects, frame: Frame) -> np.ndarray:
     return np.flatnonzero(tall & (chosen.truncated == 0) & (chosen.occluded == 0))
 
 
-def _check_results(dataset: KittiFrames, folder: Path) -> Iterator[Finding]:
-    """Findings about a folder of result files."""
+def check_results(frame_ids: Sequence[str], folder: Path) -> Iterator[Finding]:
+    """What is wrong with a folder of KITTI result files for these frames."""
     if (folder / "data").is_dir():
         folder = folder / "data"
-    missing = [frame_id for frame_id in dataset.ids if not (folder / f"{frame_id}.txt").is_file()]
+    missing = [frame_id for frame_id in frame_ids if not (folder / f"{frame_id}.txt").is_file()]
     if missing:
         yield Finding(
-            "KIT10", "error", f"{folder} lacks {len(missing)} of {len(dataset)} frames, first {missing[0]}.txt"
+            "KIT10", "error", f"{folder} lacks {len(missing)} of {len(frame_ids)} frames, first {missing[0]}.txt"
         )
     low, high = np.inf, -np.inf
-    for frame_id in sorted(set(dataset.ids) - set(missing)):
+    for frame_id in sorted(set(frame_ids) - set(missing)):
         try:
             scores = read_objects(folder / f"{frame_id}.txt", results=True).scores
         except Lcf3dError as error:

@@ -49,9 +49,18 @@ SYNONYMS: Mapping[str, tuple[str, ...]] = {
     "person": ("person", "pedestrian"),
     "pedestrian": ("pedestrian", "person"),
     "bicycle": ("bicycle", "cyclist"),
-    "cyclist": ("cyclist", "bicycle"),
+    "cyclist": ("cyclist", "bicyclist", "bicycle"),
+    "bicyclist": ("bicyclist", "cyclist", "bicycle"),
     "motorcyclist": ("motorcyclist", "motorcycle", "cyclist"),
-    "van": ("van", "car"),
+    "car": ("car", "regular_vehicle"),
+    "van": ("van", "car", "regular_vehicle"),
+    "regular_vehicle": ("regular_vehicle", "car"),
+    "box_truck": ("box_truck", "truck"),
+    "trailer": ("trailer", "vehicular_trailer"),
+    "vehicular_trailer": ("vehicular_trailer", "trailer"),
+    "traffic_cone": ("traffic_cone", "construction_cone"),
+    "construction_cone": ("construction_cone", "traffic_cone"),
+    "stop sign": ("stop sign", "stop_sign"),
 }
 
 

@@ -221,6 +221,12 @@ def _greedy_matches(annotated, starts, predicted, groups, thresholds):  # type: 
     return matches
 
 
+def heading_errors(yaws: FloatArray, other_yaws: FloatArray, period: FloatArray | float = 2 * np.pi) -> FloatArray:
+    """(K,) angles in radians between (K,) headings that look alike after a turn by ``period``."""
+    errors: FloatArray = np.abs((yaws - other_yaws + period / 2) % period - period / 2)
+    return errors
+
+
 def _pair_errors(
     ground_truth: EvaluationBoxes, g: IntArray, predictions: EvaluationBoxes, p: IntArray, half_turn: FloatArray
 ) -> FloatArray:
@@ -230,7 +236,6 @@ def _pair_errors(
     shared = np.minimum(sizes, truth_sizes).prod(axis=1)
     union = sizes.prod(axis=1) + truth_sizes.prod(axis=1) - shared
     period = np.where(half_turn[ground_truth.labels[g]], np.pi, 2 * np.pi)
-    turn = (ground_truth.yaws[g] - predictions.yaws[p] + period / 2) % period - period / 2
     velocity = predictions.velocities[p] - ground_truth.velocities[g]
     attribute = np.where(
         ground_truth.attributes[g] < 0, np.nan, ground_truth.attributes[g] != predictions.attributes[p]
@@ -239,7 +244,7 @@ def _pair_errors(
         [
             np.hypot(offset[:, 0], offset[:, 1]),
             1 - shared / union,
-            np.abs(turn),
+            heading_errors(ground_truth.yaws[g], predictions.yaws[p], period),
             np.hypot(velocity[:, 0], velocity[:, 1]),
             attribute,
         ]

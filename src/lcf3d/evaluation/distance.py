@@ -83,7 +83,8 @@ class DistanceEvaluation:
             raise DatasetError(
                 f"{len(absent)} of {len(labels)} frames have no labels, first {absent[0]}: evaluation needs them"
             )
-        return [self._seen(found.with_classes(self.class_names), f) for f, (_, found) in enumerate(labels) if found]
+        known = [found.with_classes(self.class_names) for _, found in labels if found is not None]
+        return [self._seen(found, f) for f, found in enumerate(known)]
 
     def _seen(self, found: Detections3D, frame: int) -> Detections3D:
         return in_camera_view(found, self._camera(frame)) if self.front else found

@@ -63,13 +63,19 @@ class KittiEvaluation:
         self.dataset: Any = dataset
         self.config = kitti_config(options.classes, options.iou)
         self.class_names = self.config.classes
-        if frame_ids is None:
-            frame_ids = dataset.ids if dataset.split is not None else split_frame_ids(dataset.root)
-        self.frame_ids = tuple(frame_ids)
-        labels = dataset.folder / "label_2"
+        self.frame_ids = tuple(self._usual_frames() if frame_ids is None else frame_ids)
+        self.truth = self._labels()
+
+    def _usual_frames(self) -> Sequence[str]:
+        """The frames that are evaluated unless others are asked for."""
+        ids: tuple[str, ...] = self.dataset.ids
+        return ids if self.dataset.split is not None else split_frame_ids(self.dataset.root)
+
+    def _labels(self) -> KittiFrames:
+        labels = self.dataset.folder / "label_2"
         if not labels.is_dir():
-            raise DatasetError(f"{labels} is not a folder; expected a KITTI tree with label_2 in {dataset.folder}")
-        self.truth = read_folder(labels, self.frame_ids, results=False)
+            raise DatasetError(f"{labels} is not a folder; expected a KITTI tree with label_2 in {labels.parent}")
+        return read_folder(labels, self.frame_ids, results=False)
 
     @cached_property
     def _frames(self) -> list[Frame]:
@@ -156,6 +162,22 @@ class KittiEvaluation:
     def compare(self, first: KittiResultSet, second: KittiResultSet, samples: int, seed: int) -> list[ComparisonRow]:
         """Every class, measure and difficulty that both result sets cover."""
         return compare(first.evaluator, second.evaluator, samples, seed)
+
+
+class KittiTrackingEvaluation(KittiEvaluation):
+    """The object benchmark's metrics over the frames of a tracking layout, a `KittiTrackingDataset`."""
+
+    def _usual_frames(self) -> Sequence[str]:
+        """All frames of labelled sequences."""
+        return [frame_id for frame_id in self.dataset.ids if self.dataset.place(frame_id)[0].has_labels]
+
+    def _labels(self) -> KittiFrames:
+        places = [self.dataset.place(frame_id) for frame_id in self.frame_ids]
+        absent = [drive.name for drive, _ in places if not drive.has_labels]
+        if absent or not places:
+            first = f", first {absent[0]}" if absent else ""
+            raise DatasetError(f"{len(absent)} frames of {self.dataset.root} are of sequences without labels{first}")
+        return KittiFrames.from_frames(self.frame_ids, [drive.objects(number) for drive, number in places])
 
 
 @dataclass(frozen=True, eq=False)

@@ -65,6 +65,34 @@ def parse_files(paths: Sequence[Path | None], columns: int) -> tuple[NDArray[np.
     return np.concatenate(names), np.concatenate(values), [count for part in counts for count in part]
 
 
+def parse_tracking(path: Path) -> tuple[IntArray, IntArray, NDArray[np.str_], FloatArray]:
+    """The lines of a tracking label file: two more columns, frame number and track id, before those of a label.
+
+    Returns:
+        (N,) frame numbers, (N,) track ids (-1 for none), (N,) classes and the (N, 14) numbers that follow; truncation
+        is written in levels there and left as it is.
+
+    Raises:
+        DatasetError: the file does not exist.
+        FormatError: a line is not what it should be; names file and line.
+    """
+    lines = [(i, fields) for i, line in enumerate(read_text(path).splitlines(), 1) if (fields := line.split())]
+    numbers = np.empty((len(lines), LABEL_COLUMNS + 1))
+    for row, (number, fields) in enumerate(lines):
+        problem = _text_problem([fields[0], *fields[1:2], *fields[3:]], LABEL_COLUMNS + 1) if len(fields) > 2 else ""
+        if len(fields) != LABEL_COLUMNS + 2:
+            problem = f"expected the {LABEL_COLUMNS + 2} columns of a tracking label, got {len(fields)}"
+        elif not problem and not (fields[0].isdigit() and fields[1].lstrip("-").isdigit()):
+            problem = f"frame number and track id must be whole numbers, got {fields[0]} {fields[1]}"
+        if problem:
+            raise FormatError(f"{path}:{number}: {problem}")
+        numbers[row] = [float(fields[0]), float(fields[1]), *map(float, fields[3:])]
+    for row in _suspicious_rows(numbers[:, 2:]):
+        raise FormatError(f"{path}:{lines[row][0]}: {_value_problem(numbers[row, 2:])}")
+    names = np.array([fields[2] for _, fields in lines], dtype=np.str_)
+    return numbers[:, 0].astype(np.int64), numbers[:, 1].astype(np.int64), names, numbers[:, 2:]
+
+
 def _parse_batch(paths: Sequence[Path | None], columns: int) -> tuple[NDArray[np.str_], FloatArray, list[int]]:
     rows: list[list[str]] = []
     counts = []

@@ -15,7 +15,7 @@ from lcf3d.errors import ConfigError
 from lcf3d.files import write_text
 from lcf3d.fusion.evidence import ROLE_EVIDENCE, Evidence
 from lcf3d.fusion.roles import ROLES, role_of
-from lcf3d.structures import KITTI_CLASSES, NUSCENES_CLASSES, FloatArray
+from lcf3d.structures import ARGOVERSE_CLASSES, KITTI_CLASSES, NUSCENES_CLASSES, FloatArray
 
 Fraction = Annotated[float, Field(ge=0, le=1)]
 
@@ -124,7 +124,7 @@ class FusionConfig(BaseModel):
 
     @classmethod
     def preset(cls, name: str, **changes: Any) -> Self:
-        """The settings of that name: ``default``, ``paper``, ``kitti`` or ``nuscenes``.
+        """The settings of that name: ``default``, ``paper``, ``kitti``, ``nuscenes`` or ``argoverse2``.
 
         Args:
             name: of the preset.
@@ -250,4 +250,6 @@ PRESETS: dict[str, dict[str, Any]] = {
         "enlargement": 0.0,
         "relabel_score": 0.8,
     },
+    # measured with simulated camera detections only: docs/argoverse2.md
+    "argoverse2": {"class_names": ARGOVERSE_CLASSES, "relabel_score": 0.8},
 }

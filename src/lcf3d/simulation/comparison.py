@@ -208,7 +208,7 @@ def draw(
     try:
         from matplotlib.figure import Figure
     except ImportError:
-        raise MissingExtraError("matplotlib", "viz", "drawing the comparison") from None
+        raise MissingExtraError("matplotlib", "simulate", "drawing the comparison") from None
     figure = Figure(figsize=(13, 7.5), dpi=90, layout="constrained")
     axes = figure.subplots(2, 3)
     both = ((real, "real KITTI", "#444444"), (simulated, "simulated", "#d9622b"))
