@@ -134,7 +134,8 @@ class ArrivingCamera:
 
     def loss(self, network: Any, step: int) -> dict[str, Any]:
         """Weighted terms of score, box and mask."""
-        return self._loss(network, self.store, self.views, self.look, self.rng)
+        terms: dict[str, Any] = self._loss(network, self.store, self.views, self.look, self.rng)
+        return terms
 
     def _loss(self, network: Any, store: ImageStore, views: DeviceViews, look: Appearance | None, rng: Any) -> Any:
         from lcf3d.training.camera_losses import Targets, losses

@@ -78,7 +78,10 @@ class ScanStore:
         self._rows: list[tuple[Any, Any, Any]] = []
         self._bank: list[list[tuple[Any, Any]]] = [[] for _ in config.class_names]
         self._rng = np.random.default_rng([seed, 7])
-        self.boxes = self.labels = self.counts = self.objects = None
+        self.boxes: Any = None
+        self.labels: Any = None
+        self.counts: Any = None
+        self.objects: Any = None
 
     def __len__(self) -> int:
         return len(self.points)
