@@ -7,7 +7,7 @@ README = Path(__file__).parents[1] / "README.md"
 def test_the_python_example_runs_as_it_stands(capsys):
     (code,) = re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL)
     exec(code, {})
-    assert "Car 0.93, matched" in capsys.readouterr().out
+    assert "Car 0.76, matched" in capsys.readouterr().out
 
 
 def test_linked_pages_and_pictures_exist():

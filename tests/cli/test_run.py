@@ -7,6 +7,7 @@ from typer.testing import CliRunner
 from lcf3d.cli.app import app
 from lcf3d.errors import Lcf3dError
 from lcf3d.formats.kitti import objects_from_detections_2d, read_objects, write_objects
+from lcf3d.fusion.config import PRESETS
 from lcf3d.geometry.camera import project_boxes
 from lcf3d.localizers.named import SHIPPED
 from lcf3d.provenance import Outcome
@@ -172,7 +173,7 @@ def test_errors_are_one_sentence_and_exit_code_2(capsys, monkeypatch):
     with pytest.raises(SystemExit) as stop:
         main()
     assert stop.value.code == 2
-    names = "default, paper, kitti, nuscenes"
+    names = ", ".join(PRESETS)
     assert capsys.readouterr().err == f"error: 'nonsense' is neither a preset ({names}) nor a file\n"
 
 

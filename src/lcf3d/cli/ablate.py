@@ -48,9 +48,7 @@ def ablate(
     from lcf3d.cli.console import plain, print_table, tracked
     from lcf3d.evaluation.ablation import ablate as measure
     from lcf3d.evaluation.protocol import open_evaluation, usual_frames
-    from lcf3d.fusion.calibration import load_calibration
-    from lcf3d.fusion.self_calibration import self_calibrate
-    from lcf3d.run.setup import RunRequest, read_inputs
+    from lcf3d.run.setup import RunRequest, find_calibration, read_inputs
     from lcf3d.run.sources import LidarOnScans
 
     request = RunRequest(
@@ -68,7 +66,7 @@ def ablate(
     found = read_inputs(request, usual_frames)
     evaluation = open_evaluation(found.dataset, found.frame_ids)
     inputs = detections_of(found)
-    scores = self_calibrate(inputs, found.config) if calibration == "auto" else load_calibration(calibration)
+    scores = find_calibration(calibration, found.dataset, found.frame_ids, found.lidar, found.cameras, found.config)
     progress, suppress = plain if json_ else tracked, isinstance(found.lidar, LidarOnScans)
     rows = measure(inputs, evaluation, found.config, scores, found.localizer, progress, suppress)
     scans = all(item.frame.points is not None for item in inputs)

@@ -20,10 +20,9 @@ from lcf3d.evaluation.domain_shift import (
     in_kitti_classes,
     split_truth,
 )
-from lcf3d.fusion.calibration import Calibration, load_calibration
 from lcf3d.fusion.config import FusionConfig
 from lcf3d.fusion.pipeline import LateCascadeFusion
-from lcf3d.fusion.self_calibration import self_calibrate
+from lcf3d.run.setup import find_calibration
 from lcf3d.run.sources import LidarOnScans, open_cameras, open_lidar
 from lcf3d.structures import KITTI_CLASSES, NUSCENES_CLASSES, Camera, Detections2D, Detections3D, Frame
 
@@ -96,6 +95,32 @@ def parse_task(text: str) -> DomainTask:
     return DomainTask(trained, tested, words[1], **values)
 
 
+@dataclass(frozen=True)
+class _InKittiClasses:
+    """A LiDAR branch in KITTI's classes."""
+
+    source: LidarSource
+
+    def detect(self, frame: Frame) -> Detections3D:
+        """3D detections of one frame."""
+        return in_kitti_classes(self.source.detect(frame))
+
+
+@dataclass(frozen=True)
+class _CameraInKittiClasses:
+    """A camera branch in KITTI's classes."""
+
+    source: CameraSource
+
+    def sees(self, frame: Frame, camera: str) -> bool:
+        """Whether there is anything to detect from."""
+        return self.source.sees(frame, camera)
+
+    def detect(self, frame: Frame, camera: str) -> Detections2D:
+        """2D detections of one camera of one frame."""
+        return camera_in_kitti_classes(self.source.detect(frame, camera))
+
+
 class DomainTaskRunner:
     """A task with its dataset and detectors opened, ready to be run.
 
@@ -142,7 +167,21 @@ class DomainTaskRunner:
         truths: list[Truth] = []
         cameras: list[Camera] = []
         found: dict[str, list[Detections3D]] = {LIDAR_ALONE: []}
-        fusion = LateCascadeFusion(self.config, calibration=self._calibration()) if self.camera else None
+        fusion = (
+            LateCascadeFusion(
+                self.config,
+                calibration=find_calibration(
+                    self.task.calibration,
+                    self.dataset,
+                    self.dataset.ids,
+                    _InKittiClasses(self.lidar),
+                    {self.front: _CameraInKittiClasses(self.camera)},
+                    self.config,
+                ),
+            )
+            if self.camera
+            else None
+        )
         for frame in self._frames():
             if frame.labels is None:
                 raise DatasetError(f"{self.task.dataset}: frame {frame.id} has no labels; evaluation needs them")
@@ -167,21 +206,6 @@ class DomainTaskRunner:
         if self.camera is None or not self.camera.sees(frame, self.front):
             return {}
         return {self.front: camera_in_kitti_classes(self.camera.detect(frame, self.front))}
-
-    def _calibration(self) -> Calibration | None:
-        """The calibration asked for; ``auto``: taught by the camera where LiDAR scores are no probabilities."""
-        if self.task.calibration != "auto":
-            return load_calibration(self.task.calibration)
-        if isinstance(self.lidar, AdaptedLidar) or all(
-            ((scores >= 0) & (scores <= 1)).all() for scores in (self.lidar.detect(f).scores for f in self._frames())
-        ):
-            return None
-        teaching = []
-        for frame in self._frames(max(1, len(self.dataset) // _TEACHING_FRAMES)):
-            if seen := self._seen(frame):
-                teaching.append((frame, in_kitti_classes(self.lidar.detect(frame)), seen))
-        # which classes the camera detects is learnt only from many frames; with few, none is taken as blind
-        return self_calibrate(teaching, self.config).model_copy(update={"camera_classes": None})
 
     def _lidar(self, text: str) -> LidarSource:
         source = open_lidar(text, self.dataset, self._names(text.partition(":")[0]))

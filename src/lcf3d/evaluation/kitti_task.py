@@ -68,8 +68,10 @@ class KittiEvaluation:
 
     def _usual_frames(self) -> Sequence[str]:
         """The frames that are evaluated unless others are asked for."""
+        if self.dataset.split is None:
+            return split_frame_ids(self.dataset.root)
         ids: tuple[str, ...] = self.dataset.ids
-        return ids if self.dataset.split is not None else split_frame_ids(self.dataset.root)
+        return ids
 
     def _labels(self) -> KittiFrames:
         labels = self.dataset.folder / "label_2"

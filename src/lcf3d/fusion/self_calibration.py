@@ -38,18 +38,25 @@ FULL_RECALL = 0.9
 BEST_SHARE = 0.02
 # before any box is seen the camera is taken to confirm 0.95 of this many
 RECALL_PRIOR = 20.0
+# the ground is flat where half of the trusted boxes lie within this slope of one height
+FLAT_SLOPE = 0.012
 
 FrameDetections = tuple[Frame, Detections3D, Mapping[str, Detections2D] | Detections2D]
 
 
 class _Observed(NamedTuple):
-    """LiDAR boxes of many frames: label, score, underside, seen by the camera, confirmed by a 2D detection."""
+    """LiDAR boxes of many frames.
+
+    Label, score, underside, distance, seen by a camera, confirmed by a 2D detection of the class, and of any class.
+    """
 
     labels: IntArray
     scores: FloatArray
     bottoms: FloatArray
+    distances: FloatArray
     visible: BoolArray
     confirmed: BoolArray
+    found: BoolArray
 
 
 def self_calibrate(frames: Iterable[FrameDetections], config: FusionConfig) -> Calibration:
@@ -86,19 +93,21 @@ def self_calibrate(frames: Iterable[FrameDetections], config: FusionConfig) -> C
     for label, name in enumerate(config.class_names):
         own = seen.labels == label
         taught = seen.visible[own] & camera_labels[label]
-        share = camera_share(seen.scores[own][taught], seen.confirmed[own][taught])
+        # a box of another class found there is the LiDAR branch's mistake, not a miss of the camera
+        share = camera_share(seen.scores[own][taught], seen.found[own][taught])
         if share < 1:
             evidence[name] = config.evidence_of(name).with_camera_share(share)
         if not own.any() or natural_transform(seen.scores[own]) == "logit":
             continue
         maps[name] = _taught_map(seen.scores[own], seen.confirmed[own], taught)
         probability[own] = maps[name](seen.scores[own])
+    trusted = probability > TEACHER_SCORE
     return Calibration(
         source=_SOURCE,
         lidar=maps,
         evidence=evidence,
         camera_classes=tuple(name for name, there in zip(config.class_names, camera_labels, strict=True) if there),
-        ground_z=ground_height(seen.bottoms[probability > TEACHER_SCORE]),
+        ground_z=flat_ground(seen.bottoms[trusted], seen.distances[trusted]),
     )
 
 
@@ -107,18 +116,36 @@ _SOURCE = "the frames of a run, without labels, with the camera as teacher"
 
 def _observe(frame: Frame, lidar: Detections3D, found: Mapping[str, Detections2D], config: FusionConfig) -> _Observed:
     """The boxes of one frame."""
-    confirmed, visible = np.zeros(len(lidar), dtype=bool), np.zeros(len(lidar), dtype=bool)
+    confirmed, visible, any_class = (np.zeros(len(lidar), dtype=bool) for _ in range(3))
     for camera in frame.cameras if len(lidar) else ():
         if camera.name not in found:
             continue
         projected, seen = project_boxes(lidar.boxes, camera)
         teachers = found[camera.name][found[camera.name].scores > TEACHER_SCORE]
         overlap = image_iou(projected, teachers.boxes)
+        any_class |= assign(overlap, config.match_iou) >= 0
         overlap[lidar.labels[:, None] != teachers.labels[None]] = 0
         confirmed |= assign(overlap, config.match_iou) >= 0
         visible |= seen
     bottoms = lidar.boxes[:, 2] - lidar.boxes[:, 5] / 2
-    return _Observed(lidar.labels, lidar.scores, bottoms, visible, confirmed)
+    distances = np.hypot(lidar.boxes[:, 0], lidar.boxes[:, 1])
+    return _Observed(lidar.labels, lidar.scores, bottoms, distances, visible, confirmed, any_class | confirmed)
+
+
+def flat_ground(bottoms: FloatArray, distances: FloatArray) -> float | None:
+    """Height of the ground under the sensor, where trusted boxes show that it is flat; None where they do not.
+
+    A tilted sensor or a hilly road puts right boxes off any one height: their height then says nothing against them.
+
+    Args:
+        bottoms: (N,) undersides of boxes that are believed, metres.
+        distances: (N,) their horizontal distances, metres.
+    """
+    height = ground_height(bottoms)
+    if height is None:
+        return None
+    slope = np.abs(bottoms - height) / np.maximum(distances, 1.0)
+    return height if np.median(slope) < FLAT_SLOPE else None
 
 
 def camera_share(scores: FloatArray, confirmed: BoolArray) -> float:

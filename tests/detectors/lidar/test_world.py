@@ -10,7 +10,6 @@ import pytest
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from datasets.nuscenes_world import START_US, world_tables, write_world
 from lcf3d.datasets.kitti import KittiDataset
 from lcf3d.datasets.nuscenes import NuscenesDataset
 from lcf3d.detectors.base import CloudRequest, cloud_request
@@ -24,6 +23,7 @@ from lcf3d.detectors.lidar.sweeps import accumulate_sweeps, cloud_of, in_view, m
 from lcf3d.errors import ConfigError, DatasetError
 from lcf3d.run.sources import LidarOnScans
 from lcf3d.structures import Camera, Detections3D, Frame, Sweep
+from tests.datasets.nuscenes_world import START_US, world_tables, write_world
 
 NUSCENES = [name for name in PRESETS if "nuscenes" in name]
 KITTI = [name for name in PRESETS if "kitti" in name]

@@ -1,7 +1,7 @@
 """Draws docs/images/stereo_pairs.jpg: 2D boxes of two views paired along epipolar lines.
 
 lcf3d simulate drives --frames 15 --seed 11
-python docs/images/stereo_pairs.py drives 000014
+python benchmarks/figures/stereo_pairs.py drives 000014
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ def main() -> None:
     whole = PIL.Image.new("RGB", (pictures[0].width, 2 * pictures[0].height + 6), (40, 43, 48))
     for row, picture in enumerate(pictures):
         whole.paste(picture, (0, row * (picture.height + 6)))
-    whole.save(Path(__file__).with_suffix(".jpg"), quality=82)
+    whole.save(Path(__file__).parents[2] / "docs" / "images" / "stereo_pairs.jpg", quality=82)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,7 @@
-"""Draws docs/images/localizer_geometric.png from a ray-cast scene: ``python docs/images/localizer_geometric.py``."""
+"""Draws docs/images/localizer_geometric.png from a ray-cast scene.
+
+python benchmarks/figures/localizer_geometric.py
+"""
 
 from __future__ import annotations
 
@@ -71,7 +74,7 @@ def main() -> None:
     above.set_aspect("equal")
     above.legend(fontsize=9, loc="upper left", framealpha=1, ncol=2)
     figure.tight_layout()
-    figure.savefig(Path(__file__).with_suffix(".png"), dpi=110)
+    figure.savefig(Path(__file__).parents[2] / "docs" / "images" / "localizer_geometric.png", dpi=110)
 
 
 if __name__ == "__main__":
