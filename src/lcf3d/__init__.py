@@ -27,6 +27,8 @@ if TYPE_CHECKING:
     from lcf3d.datasets.nuscenes import NuscenesDataset
     from lcf3d.datasets.opening import open_dataset
     from lcf3d.detectors.named import load_detector
+    from lcf3d.evaluation.domain_shift import DOMAINS, adapt_points
+    from lcf3d.evaluation.generalization import evaluate_generalization
     from lcf3d.formats.coco import read_camera_detections, read_coco_index, read_coco_results
     from lcf3d.formats.plain import read_detections_2d, read_detections_3d, write_detections_2d, write_detections_3d
     from lcf3d.fusion.calibration import Calibration
@@ -35,7 +37,9 @@ if TYPE_CHECKING:
     from lcf3d.fusion.pipeline import LateCascadeFusion
     from lcf3d.fusion.self_calibration import self_calibrate
     from lcf3d.fusion.stereo import StereoConfig, StereoLateCascadeFusion
+    from lcf3d.localizers.geometric import GeometricLocalizer
     from lcf3d.localizers.named import load_localizer
+    from lcf3d.localizers.shapes import SHAPES, ObjectShape
     from lcf3d.provenance import FusedDetections, Outcome, Reason
 
 try:
@@ -58,7 +62,13 @@ _LAZY = {
     "Reason": "provenance",
     "StereoConfig": "fusion.stereo",
     "StereoLateCascadeFusion": "fusion.stereo",
+    "DOMAINS": "evaluation.domain_shift",
+    "GeometricLocalizer": "localizers.geometric",
+    "ObjectShape": "localizers.shapes",
+    "SHAPES": "localizers.shapes",
+    "adapt_points": "evaluation.domain_shift",
     "draw": "api",
+    "evaluate_generalization": "evaluation.generalization",
     "evaluate": "api",
     "load_detector": "detectors.named",
     "load_localizer": "localizers.named",
@@ -79,8 +89,10 @@ _LAZY = {
 
 __all__ = [
     "ARGOVERSE_CLASSES",
+    "DOMAINS",
     "KITTI_CLASSES",
     "NUSCENES_CLASSES",
+    "SHAPES",
     "BaseDataset",
     "Calibration",
     "Camera",
@@ -92,17 +104,21 @@ __all__ = [
     "Frame",
     "FusedDetections",
     "FusionConfig",
+    "GeometricLocalizer",
     "InstanceMask",
     "KittiDataset",
     "LateCascadeFusion",
     "Lcf3dError",
     "NuscenesDataset",
+    "ObjectShape",
     "Outcome",
     "Reason",
     "StereoConfig",
     "StereoLateCascadeFusion",
+    "adapt_points",
     "draw",
     "evaluate",
+    "evaluate_generalization",
     "load_detector",
     "load_localizer",
     "open_dataset",
