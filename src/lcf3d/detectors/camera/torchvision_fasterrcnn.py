@@ -33,62 +33,12 @@ from lcf3d.detectors.classes import to_classes
 from lcf3d.detectors.downloads import local_path
 from lcf3d.errors import ConfigError, ShapeError
 from lcf3d.networks.checkpoints import load_parameters, read_notes, read_state_dict
+from lcf3d.networks.convolution import FeaturePyramid
+from lcf3d.networks.resnet import ResNet
 from lcf3d.networks.torch import Tensor, functional, nn, torch, torch_device, torchvision
 from lcf3d.structures import Detections2D
 
 STRIDES = (4, 8, 16, 32, 64)
-
-
-class _Named(nn.Module):
-    """A convolution under the name ``conv``."""
-
-    def __init__(self, in_channels: int, out_channels: int, kernel: int) -> None:
-        super().__init__()
-        self.conv = nn.Conv2d(in_channels, out_channels, kernel, padding=kernel // 2)
-
-    def forward(self, x: Tensor) -> Tensor:
-        """(N, in, H, W) -> (N, out, H, W)."""
-        return self.conv(x)
-
-
-class Backbone(nn.Module):
-    """torchvision's ResNet without its classifier."""
-
-    def __init__(self, depth: int, caffe: bool) -> None:
-        super().__init__()
-        resnet = getattr(torchvision().models, f"resnet{depth}")(weights=None)
-        for name in ("conv1", "bn1", "layer1", "layer2", "layer3", "layer4"):
-            setattr(self, name, getattr(resnet, name))
-        if caffe:
-            for layer in (self.layer2, self.layer3, self.layer4):
-                layer[0].conv1.stride, layer[0].conv2.stride = (2, 2), (1, 1)
-
-    def forward(self, image: Tensor) -> list[Tensor]:
-        """Maps of strides 4, 8, 16 and 32."""
-        x = functional.relu(self.bn1(self.conv1(image)))
-        x = functional.max_pool2d(x, 3, 2, 1)
-        maps = []
-        for layer in (self.layer1, self.layer2, self.layer3, self.layer4):
-            x = layer(x)
-            maps.append(x)
-        return maps
-
-
-class Neck(nn.Module):
-    """Feature pyramid (Lin et al., CVPR 2017); the fifth level is every second cell of the fourth."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.lateral_convs = nn.ModuleList([_Named(channels, 256, 1) for channels in (256, 512, 1024, 2048)])
-        self.fpn_convs = nn.ModuleList([_Named(256, 256, 3) for _ in range(4)])
-
-    def forward(self, maps: Sequence[Tensor]) -> list[Tensor]:
-        """Five maps of 256 channels at strides 4 to 64."""
-        sums = [conv(x) for conv, x in zip(self.lateral_convs, maps, strict=True)]
-        for i in range(3, 0, -1):
-            sums[i - 1] = sums[i - 1] + functional.interpolate(sums[i], size=sums[i - 1].shape[-2:], mode="nearest")
-        outputs = [conv(x) for conv, x in zip(self.fpn_convs, sums, strict=True)]
-        return [*outputs, functional.max_pool2d(outputs[-1], 1, 2)]
 
 
 class RPNHead(nn.Module):
@@ -137,8 +87,8 @@ class FasterRCNNNetwork(nn.Module):
     def __init__(self, depth: int, style: Style, masks: bool = False) -> None:
         super().__init__()
         self.style = style
-        self.backbone = Backbone(depth, style.caffe)
-        self.neck = Neck()
+        self.backbone = ResNet(depth, style.caffe)
+        self.neck = FeaturePyramid((256, 512, 1024, 2048), extra=True)
         self.rpn_head = RPNHead(len(style.ratios))
         self.roi_head = _RoIHead(len(style.classes), masks)
 
