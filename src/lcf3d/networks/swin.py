@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from lcf3d.networks.attention import FeedForward
 from lcf3d.networks.torch import Tensor, functional, nn, torch
 
 MASKED = -100.0
@@ -90,18 +91,6 @@ class ShiftedWindowAttention(nn.Module):
         if self.shift:
             x = x.roll((self.shift, self.shift), dims=(1, 2))
         return x[:, :height, :width]
-
-
-class FeedForward(nn.Module):
-    """Linear, activation, linear, added to the input; the names are ``layers.0.0`` and ``layers.1``."""
-
-    def __init__(self, channels: int, hidden: int, activation: nn.Module) -> None:
-        super().__init__()
-        self.layers = nn.Sequential(nn.Sequential(nn.Linear(channels, hidden), activation), nn.Linear(hidden, channels))
-
-    def forward(self, x: Tensor, shortcut: Tensor | None = None) -> Tensor:
-        """(..., C) -> (..., C); added to ``shortcut``, or to the input without one."""
-        return (x if shortcut is None else shortcut) + self.layers(x)
 
 
 class SwinBlock(nn.Module):

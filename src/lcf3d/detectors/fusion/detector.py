@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from lcf3d.detectors.classes import class_mapping
 from lcf3d.detectors.lidar.detector import channels_innermost
 from lcf3d.detectors.lidar.fusing import fuse_batch_norm
+from lcf3d.detectors.lidar.loading import load_published
 from lcf3d.errors import ConfigError, DatasetError
-from lcf3d.networks.checkpoints import load_parameters
 from lcf3d.networks.torch import nn, torch, torch_device
 from lcf3d.structures import Detections3D, Frame
 
@@ -92,5 +92,5 @@ def filled(build: Any, state: Mapping[str, Any], name: str) -> nn.Module:
     """
     with torch.device("meta"):
         network: nn.Module = build()
-    load_parameters(network, state, name)
+    load_published(network, state, name)
     return network
