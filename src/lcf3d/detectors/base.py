@@ -12,7 +12,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from lcf3d.structures import Detections2D, Detections3D
+from lcf3d.structures import Detections2D, Detections3D, Frame
 
 Image = NDArray[np.uint8]
 
@@ -63,6 +63,21 @@ class LidarDetector(Protocol):
 
         Args:
             points: (N, 4 or more) float32 ``x, y, z, intensity, ...`` in the LiDAR frame.
+
+        Returns:
+            3D boxes in the LiDAR frame.
+        """
+        ...
+
+
+class FrameDetector(Protocol):
+    """A detector of points and images together, which may stand where the LiDAR branch stands."""
+
+    def detect_frame(self, frame: Frame) -> Detections3D:
+        """Detect objects in one frame.
+
+        Args:
+            frame: with a scan, images and calibrated cameras.
 
         Returns:
             3D boxes in the LiDAR frame.

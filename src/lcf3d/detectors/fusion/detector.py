@@ -21,9 +21,9 @@ Arrays = dict[str, NDArray[Any]]
 
 
 class FusionDetector(ABC):
-    """A detector of frames: ``detector.detect(frame) -> Detections3D``.
+    """A detector of frames: ``detector.detect_frame(frame) -> Detections3D``.
 
-    It stands where a LiDAR branch stands (see `lcf3d.run.sources.LidarSource`): alone, or in front of the fusion.
+    It may stand where a LiDAR branch stands: alone, or before the fusion with a camera branch.
 
     Args:
         network: with its weights.
@@ -51,7 +51,7 @@ class FusionDetector(ABC):
         self.device = torch_device(device)
         self.network = channels_innermost(fuse_batch_norm(network.eval()).requires_grad_(False).to(self.device))
 
-    def detect(self, frame: Frame) -> Detections3D:
+    def detect_frame(self, frame: Frame) -> Detections3D:
         """Detections in a frame, in its LiDAR frame; none where no point lies in the network's range.
 
         Raises:

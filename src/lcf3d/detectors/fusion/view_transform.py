@@ -51,15 +51,16 @@ def ray_points(image_from_camera: Tensor, lidar_from_camera: Tensor, resize: Ten
     Args:
         image_from_camera: (N, 3, 3) camera matrices of the original images.
         lidar_from_camera: (N, 4, 4).
-        resize: (N, 3) scale, then column and row by which the network's image lies left of and above the original's.
+        resize: (N, 3) scale, then column and row by which the network's image lies right of and below the original's.
     """
-    points = frustum().to(resize.device).expand(len(resize), -1, -1, -1, -1)
-    scale, offset = resize[:, 0, None, None, None, None], resize[:, None, None, None, 1:]
-    pixels, depth = (points[..., :2] + offset) / scale, points[..., 2:]
-    rays = torch.cat([pixels * depth, depth], dim=-1)
-    turn = lidar_from_camera[:, :3, :3] @ torch.inverse(image_from_camera)
-    turned = (rays.reshape(len(resize), -1, 3) @ turn.transpose(1, 2)).reshape(rays.shape)
-    return turned + lidar_from_camera[:, None, None, None, :3, 3]
+    points = frustum().to(resize.device)
+    cameras = []
+    turns = lidar_from_camera[:, :3, :3] @ torch.inverse(image_from_camera)
+    for turn, origin, placed in zip(turns, lidar_from_camera[:, :3, 3], resize, strict=True):
+        u, v = ((points[..., i] + placed[1 + i]) * (1 / placed[0]) * points[..., 2] for i in range(2))
+        turned = u[..., None] * turn[:, 0] + v[..., None] * turn[:, 1] + points[..., 2:] * turn[:, 2]
+        cameras.append(turned + origin)
+    return torch.stack(cameras)
 
 
 def bev_cells(points: Tensor) -> Tensor:
@@ -103,12 +104,16 @@ def depth_map(
 ) -> NDArray[np.float32]:
     """(1, 256, 704) depth of the LiDAR point at each pixel of the network's image, 0 without one; the last one counts.
 
+    In single precision and term by term, as in training: a point on the border of two pixels falls into the same one.
+
     Args:
         points: (P, 3 or more).
-        image_from_lidar: (4, 4) homogeneous pixels of the original image.
+        image_from_lidar: (3 or 4, 4) homogeneous pixels of the original image.
         resize: (3,) see `ray_points`.
     """
-    homogeneous = points[:, :3] @ image_from_lidar[:3, :3].T + image_from_lidar[:3, 3]
+    x, y, z = (points[:, i : i + 1] for i in range(3))
+    turn, origin = image_from_lidar[:3, :3].T, image_from_lidar[:3, 3]
+    homogeneous = x * turn[0] + y * turn[1] + z * turn[2] + origin
     depth = homogeneous[:, 2]
     pixels = homogeneous[:, :2] / np.clip(depth, 1e-5, 1e5)[:, None] * resize[0] - resize[1:]
     inside = ((pixels >= 0) & (pixels < (IMAGE_SHAPE[1], IMAGE_SHAPE[0]))).all(axis=1)
