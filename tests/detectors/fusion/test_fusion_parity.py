@@ -71,7 +71,7 @@ def test_mvxnet(golden, capture, kitti_frame, prefix, size):
 
 
 def bevfusion(data, frame, capture):
-    """Detector, its inputs with the matrices of the parity data, and the outputs of its parts by the original's names."""
+    """Detector, its inputs with the matrices of the parity data, and outputs of its parts by the original's names."""
     detector = BEVFusion.from_state_dict(data.state())
     network = detector.network
     inputs = detector.inputs(frame)
