@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 torch = pytest.importorskip("torch")
 
 from lcf3d.detectors.fusion import bevfusion, mvxnet, view_transform  # noqa: E402
-from lcf3d.detectors.fusion.images import image_of, points_in_image, resize_bilinear  # noqa: E402
+from lcf3d.detectors.fusion.images import image_of, points_in_image  # noqa: E402
 from lcf3d.errors import ConfigError, DatasetError, DetectorError, ShapeError  # noqa: E402
 from lcf3d.structures import Camera, Frame  # noqa: E402
 
@@ -35,19 +33,6 @@ class Fake(torch.nn.Module):
 
 
 class TestImages:
-    def test_the_other_size_by_hand(self):
-        image = np.array([[[0] * 3, [100] * 3]], np.uint8)
-        # places -0.25, 0.25, 0.75, 1.25 between the centres of the two pixels
-        assert resize_bilinear(image, 4, 1)[0, :, 0].tolist() == [0, 25, 75, 100]
-
-    @given(st.integers(0, 255), st.integers(1, 9), st.integers(1, 9))
-    def test_one_colour_stays(self, value, width, height):
-        image = np.full((4, 5, 3), value, np.uint8)
-        resized = resize_bilinear(image, width, height)
-        assert resized.shape == (height, width, 3)
-        # fixed-point sums of an edge may fall short by one
-        assert (np.abs(resized.astype(int) - value) <= 1).all()
-
     def test_points_seen(self):
         assert points_in_image(POINTS, camera()).tolist() == [True, True, False, False]
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from lcf3d.detectors.base import Image
 from lcf3d.detectors.fusion.detector import Arrays, FusionDetector, filled
-from lcf3d.detectors.fusion.images import image_of, points_in_image, resize_bilinear
+from lcf3d.detectors.fusion.images import image_of, points_in_image
 from lcf3d.detectors.lidar.detector import to_arrays
 from lcf3d.detectors.lidar.encoders import pillar_maximum
 from lcf3d.detectors.lidar.heads import AnchorHead, AnchorMaps
@@ -29,6 +29,7 @@ from lcf3d.detectors.lidar.sparse_encoders import SparseEncoder, sparse_shape
 from lcf3d.detectors.lidar.suppression import NmsMode, suppression_threshold
 from lcf3d.detectors.lidar.voxelization import decorate, voxelize
 from lcf3d.detectors.lidar.voxels import voxel_backbone
+from lcf3d.detectors.resizing import fitted_size, resize_bilinear
 from lcf3d.networks.checkpoints import read_state_dict
 from lcf3d.networks.convolution import ConvModule, FeaturePyramid
 from lcf3d.networks.resnet import ResNet
@@ -199,7 +200,9 @@ class MVXNet(FusionDetector):
         voxels = voxelize(network_points(points[points_in_image(points, camera)], CONFIG), CONFIG.voxels)
         if not len(voxels):
             return None
-        width, height = (camera.width, camera.height) if image_size is None else fit(camera, image_size)
+        width, height = camera.width, camera.height
+        if image_size is not None:
+            width, height = fitted_size(width, height, image_size)
         prepared = prepare_image(image, width, height)
         return {
             "features": decorate(voxels, CONFIG.voxels, offsets_replace_position=False),
@@ -212,13 +215,6 @@ class MVXNet(FusionDetector):
     def decode(self, maps: AnchorMaps) -> Detections3D:
         """Detections from the head's output maps."""
         return map_detections(to_arrays(maps), CONFIG, self.score_threshold, self.nms)
-
-
-def fit(camera: Camera, image_size: tuple[int, int]) -> tuple[int, int]:
-    """(width, height) of the camera's image when it fits the longer and the shorter side of ``image_size``."""
-    sides = camera.width, camera.height
-    scale = min(max(image_size) / max(sides), min(image_size) / min(sides))
-    return int(camera.width * scale + 0.5), int(camera.height * scale + 0.5)
 
 
 def prepare_image(image: Image, width: int, height: int) -> NDArray[np.float32]:
