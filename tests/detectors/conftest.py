@@ -36,9 +36,18 @@ class Golden:
         shapes = json.loads((self.folder / f"{self.name.removesuffix('.one_thread')}.shapes.json").read_text())
         state = {name: torch.from_numpy(value) for name, value in self.fill.fill_state_dict(shapes).items()}
         for ending, factor in self.info.get("filled_values_multiplied_by", {}).items():
-            state.update({name: value * factor for name, value in state.items() if name.endswith(ending)})
+            chosen = [name for name in state if name.endswith(ending.removeprefix("*"))]
+            state.update({name: state[name] * self._factor(state, name, factor) for name in chosen})
         constants = self.info.get("constants_not_filled", {})
         return {name: value for name, value in state.items() if name not in constants}
+
+    @staticmethod
+    def _factor(state: dict[str, Any], name: str, factor: float | str) -> float:
+        """The number that a filled parameter is multiplied by; of standardized convolutions it is told in words."""
+        if not isinstance(factor, str):
+            return factor
+        weights = state[name.rpartition(".")[0] + ".weight"][0].numel()
+        return 1 / weights if factor == "1 / n" else weights**-0.5
 
     def points(self, columns: tuple[int, ...] = (0, 1, 2, 3)) -> np.ndarray:
         """(N, 5) the scan as a user would give it: ``columns`` says where each column of the input goes.

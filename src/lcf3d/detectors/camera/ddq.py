@@ -9,33 +9,18 @@ checkpoints load, with 80 classes or others.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from lcf3d.detectors.base import Image
-from lcf3d.detectors.classes import COCO_CLASSES, to_classes
-from lcf3d.detectors.resizing import fitted_size, resize_bilinear
-from lcf3d.errors import ConfigError, DetectorError, ShapeError
+from lcf3d.detectors.camera.checkpoint_detector import CheckpointDetector
 from lcf3d.networks.attention import Attention, FeedForward
-from lcf3d.networks.checkpoints import load_parameters, read_state_dict
-from lcf3d.networks.deformable import (
-    DeformableAttention,
-    box_positions,
-    inverse_sigmoid,
-    map_positions,
-)
+from lcf3d.networks.deformable import DeformableAttention, box_positions, inverse_sigmoid, map_positions
 from lcf3d.networks.resnet import ResNet
 from lcf3d.networks.swin import SwinTransformer
-from lcf3d.networks.torch import Tensor, nn, torch, torch_device, torchvision
-from lcf3d.structures import KITTI_CLASSES, Detections2D
+from lcf3d.networks.torch import Tensor, nn, torch, torchvision
+from lcf3d.structures import FloatArray, IntArray
 
-IMAGE_SIZE = (1333, 800)
-"""Longer and shorter side that an image is brought into, in pixels."""
-MEAN = np.array([123.675, 116.28, 103.53], np.float32)
-STD = np.array([58.395, 57.12, 57.375], np.float32)
-"""Of the image's channels red, green, blue."""
 CHANNELS, HEADS, LEVELS, POINTS, HIDDEN, LAYERS = 256, 8, 4, 4, 2048, 6
 QUERIES = 900
 DISTINCT_IOU = 0.8
@@ -286,122 +271,35 @@ def distinct_boxes(boxes: Tensor, scores: Tensor) -> Tensor:
     return kept
 
 
-class DDQDetector:
-    """DDQ-DETR with ResNet-50 or Swin-L from an OpenMMLab checkpoint; a `CameraDetector`.
+class DDQDetector(CheckpointDetector):
+    """DDQ-DETR with ResNet-50 or Swin-L; see `CheckpointDetector` for its settings."""
 
-    Args:
-        path: checkpoint file; no code in it is executed.
-        class_names: classes the detections shall have, mapped by name; the network's own without it.
-        score_threshold: boxes need a higher score.
-        classes: the checkpoint's own classes, comma-separated, where they are not COCO's or KITTI's.
-        device: torch device.
-
-    Raises:
-        DetectorError: the file cannot be read, or is no such network.
-        ConfigError: another number of classes than the checkpoint's, or unknown device.
-    """
-
-    def __init__(
-        self,
-        path: Path | str,
-        class_names: Sequence[str] | None = None,
-        score_threshold: float = 0.05,
-        classes: str = "",
-        device: str = "cpu",
-    ) -> None:
-        self._setup(read_state_dict(Path(path)), class_names, score_threshold, classes, device)
+    name = "DDQ-DETR"
+    marks = ("bbox_head.cls_branches.0.weight", "query_map.weight")
 
     @classmethod
-    def from_state_dict(cls, state: Mapping[str, Any], **options: Any) -> DDQDetector:
-        """The detector with given weights; options as of the class."""
-        detector = cls.__new__(cls)
-        settings = {"class_names": None, "score_threshold": 0.05, "classes": "", "device": "cpu", **options}
-        detector._setup(state, **settings)
-        return detector
+    def build(cls, state: Mapping[str, Any]) -> nn.Module:
+        """The network that a checkpoint is for."""
+        return DDQNetwork("backbone.patch_embed.projection.weight" in state, cls.class_count(state))
 
-    def _setup(
-        self,
-        state: Mapping[str, Any],
-        class_names: Sequence[str] | None,
-        score_threshold: float,
-        classes: str,
-        device: str,
-    ) -> None:
-        torchvision()
-        name = "bbox_head.cls_branches.0.weight"
-        if name not in state or "query_map.weight" not in state:
-            raise DetectorError(f"the checkpoint is no DDQ-DETR of OpenMMLab: it lacks {name} or query_map.weight")
-        self.network_classes = network_classes(len(state[name]), classes)
-        swin = "backbone.patch_embed.projection.weight" in state
-        with torch.device("meta"):
-            network = DDQNetwork(swin, len(self.network_classes))
-        load_parameters(network, own_parameters(state), f"the checkpoint for DDQ-DETR ({'Swin-L' if swin else 'R-50'})")
-        self.device = torch_device(device)
-        self.network = network.eval().requires_grad_(False).to(self.device)
-        self.class_names = self.network_classes if class_names is None else tuple(class_names)
-        self.score_threshold = score_threshold
+    @classmethod
+    def class_count(cls, state: Mapping[str, Any]) -> int:
+        """Number of a checkpoint's classes."""
+        return len(state[cls.marks[0]])
 
-    def __call__(self, images: Sequence[Image]) -> list[Detections2D]:
-        """Detections in (H, W, 3) uint8 RGB images."""
-        return [self._detect(image) for image in images]
+    @classmethod
+    def own_parameters(cls, state: Mapping[str, Any]) -> dict[str, Any]:
+        """Without those that only training needs, and without constants."""
+        return {
+            name: value
+            for name, value in state.items()
+            if not name.startswith(_TRAINING_ONLY) and not name.endswith("relative_position_index")
+        }
 
-    def _detect(self, image: Image) -> Detections2D:
-        with torch.inference_mode():
-            scores, boxes = self.network(self.prepare(image))
-        found = best_detections(scores, boxes, (image.shape[1], image.shape[0]), self.network_classes)
-        return to_classes(found[found.scores > self.score_threshold], self.class_names)
-
-    def prepare(self, image: Image, image_size: tuple[int, int] | None = IMAGE_SIZE) -> Tensor:
-        """(1, 3, H, W) input of the network; None for ``image_size`` leaves the image at its size.
-
-        Raises:
-            ShapeError: not an RGB image.
-        """
-        if image.ndim != 3 or image.shape[2] != 3 or not image.size:
-            raise ShapeError(f"an image must have shape (H, W, 3), got {image.shape}")
-        if image_size is not None:
-            image = resize_bilinear(image, *fitted_size(image.shape[1], image.shape[0], image_size))
-        normalized = ((image - MEAN) / STD).transpose(2, 0, 1)[None]
-        return torch.from_numpy(np.ascontiguousarray(normalized)).to(self.device)
-
-
-def best_detections(scores: Tensor, boxes: Tensor, size: tuple[int, int], classes: tuple[str, ...]) -> Detections2D:
-    """The best pairs of a query and a class, at most `MAX_BOXES`.
-
-    Args:
-        scores: (N, K).
-        boxes: (N, 4) ``cx cy w h`` in parts of the image.
-        size: width and height of the image in pixels.
-        classes: names of the K classes.
-    """
-    best = scores.flatten().topk(min(MAX_BOXES, scores.numel()))
-    scale = np.tile(np.array(size, np.float64), 2)
-    pixels = corners(boxes[best.indices // len(classes)]).cpu().numpy() * scale
-    labels = (best.indices % len(classes)).cpu().numpy()
-    return Detections2D(np.clip(pixels, 0, scale), best.values.cpu().numpy(), labels, classes)
-
-
-def network_classes(count: int, names: str) -> tuple[str, ...]:
-    """Names of a checkpoint's classes: those given, or COCO's 80 or KITTI's 3.
-
-    Raises:
-        ConfigError: neither, or another number of names.
-    """
-    if names:
-        given = tuple(name.strip() for name in names.split(","))
-        if len(given) != count:
-            raise ConfigError(f"the checkpoint has {count} classes, {len(given)} are named")
-        return given
-    for known in (COCO_CLASSES, KITTI_CLASSES):
-        if len(known) == count:
-            return known
-    raise ConfigError(f"the checkpoint has {count} classes: name them in their order, ?classes=Car,Pedestrian,...")
-
-
-def own_parameters(state: Mapping[str, Any]) -> dict[str, Any]:
-    """A checkpoint's parameters without those that only training needs, and without constants."""
-    return {
-        name: value
-        for name, value in state.items()
-        if not name.startswith(_TRAINING_ONLY) and not name.endswith("relative_position_index")
-    }
+    def find(self, image: Tensor, width: int, height: int) -> tuple[FloatArray, FloatArray, IntArray]:
+        """The best pairs of a query and a class, at most `MAX_BOXES`; see `CheckpointDetector.find`."""
+        scores, boxes = self.network(image)
+        best = scores.flatten().topk(min(MAX_BOXES, scores.numel()))
+        pixels = corners(boxes[best.indices // scores.shape[1]]).cpu().numpy() * np.tile([width, height], 2)
+        labels: IntArray = (best.indices % scores.shape[1]).cpu().numpy()
+        return pixels, best.values.cpu().numpy(), labels

@@ -55,18 +55,46 @@ class RPNHead(nn.Module):
         hidden = [functional.relu(self.rpn_conv(x)) for x in maps]
         return [self.rpn_cls(x) for x in hidden], [self.rpn_reg(x) for x in hidden]
 
+    def propose(
+        self, maps: Sequence[Tensor], scale: float, ratios: Sequence[float], height: int, width: int
+    ) -> tuple[Tensor, Tensor]:
+        """(R, 4) at most 1,000 regions in pixels, best first, and their (R,) objectness.
+
+        Args:
+            maps: of strides 4 to 64.
+            scale: side of the square anchor in strides.
+            ratios: height over width of the anchors.
+            height: of the image in pixels.
+            width: of the image in pixels.
+        """
+        boxes, scores, levels = [], [], []
+        for level, (logits, residuals) in enumerate(zip(*self(maps), strict=True)):
+            objectness = logits[0].permute(1, 2, 0).reshape(-1).sigmoid()
+            best = objectness.topk(min(1000, len(objectness))).indices
+            anchors = anchor_grid(logits.shape[-2:], STRIDES[level], scale, ratios)
+            flat = residuals[0].permute(1, 2, 0).reshape(-1, 4)
+            boxes.append(clip_boxes(decode_boxes(anchors.to(flat)[best], flat[best]), height, width))
+            scores.append(objectness[best])
+            levels.append(torch.full_like(best, level))
+        all_boxes, all_scores, all_levels = torch.cat(boxes), torch.cat(scores), torch.cat(levels)
+        sides = all_boxes[:, 2:] - all_boxes[:, :2]
+        valid = (sides > 0).all(dim=1)
+        all_boxes, all_scores, all_levels = all_boxes[valid], all_scores[valid], all_levels[valid]
+        kept = torchvision().ops.batched_nms(all_boxes, all_scores, all_levels, 0.7)[:1000]
+        return all_boxes[kept], all_scores[kept]
+
 
 class BoxHead(nn.Module):
-    """Class logits and class-wise residuals of each region."""
+    """Class logits and residuals of each region, class by class or (``agnostic``) one for all classes."""
 
-    def __init__(self, classes: int) -> None:
+    def __init__(self, classes: int, agnostic: bool = False) -> None:
         super().__init__()
         self.shared_fcs = nn.ModuleList([nn.Linear(256 * 49, 1024), nn.Linear(1024, 1024)])
         self.fc_cls = nn.Linear(1024, classes + 1)
-        self.fc_reg = nn.Linear(1024, classes * 4)
+        self.fc_reg = nn.Linear(1024, 4 if agnostic else classes * 4)
 
     def forward(self, pooled: Tensor) -> tuple[Tensor, Tensor]:
-        """(R, K + 1) logits, background last, and (R, 4 K) residuals, from (R, 256, 7, 7)."""
+        """(R, K + 1) logits, background last, and (R, 4 K or 4) residuals, from (R, 256, 7, 7)."""
         x = pooled.flatten(1)
         for layer in self.shared_fcs:
             x = functional.relu(layer(x))
@@ -92,23 +120,6 @@ class FasterRCNNNetwork(nn.Module):
         self.rpn_head = RPNHead(len(style.ratios))
         self.roi_head = _RoIHead(len(style.classes), masks)
 
-    def regions(self, maps: Sequence[Tensor], height: int, width: int) -> Tensor:
-        """(R, 4) at most 1,000 proposals in pixels, best first."""
-        boxes, scores, levels = [], [], []
-        for level, (logits, residuals) in enumerate(zip(*self.rpn_head(maps), strict=True)):
-            objectness = logits[0].permute(1, 2, 0).reshape(-1).sigmoid()
-            best = objectness.topk(min(1000, len(objectness))).indices
-            anchors = anchor_grid(logits.shape[-2:], STRIDES[level], self.style.scale, self.style.ratios)
-            flat = residuals[0].permute(1, 2, 0).reshape(-1, 4)
-            boxes.append(clip_boxes(decode_boxes(anchors.to(flat)[best], flat[best]), height, width))
-            scores.append(objectness[best])
-            levels.append(torch.full_like(best, level))
-        all_boxes, all_scores, all_levels = torch.cat(boxes), torch.cat(scores), torch.cat(levels)
-        sides = all_boxes[:, 2:] - all_boxes[:, :2]
-        valid = (sides > 0).all(dim=1)
-        all_boxes, all_scores, all_levels = all_boxes[valid], all_scores[valid], all_levels[valid]
-        return all_boxes[torchvision().ops.batched_nms(all_boxes, all_scores, all_levels, 0.7)[:1000]]
-
     def maps(self, image: Tensor) -> list[Tensor]:
         """The feature pyramid of a padded (1, 3, H, W) image."""
         pyramid: list[Tensor] = self.neck(self.backbone(image))
@@ -116,7 +127,7 @@ class FasterRCNNNetwork(nn.Module):
 
     def forward(self, maps: Sequence[Tensor], height: int, width: int) -> tuple[Tensor, Tensor]:
         """(R, K) scores and (R, K, 4) boxes of the regions of an image of height x width pixels, from its `maps`."""
-        regions = self.regions(maps, height, width)
+        regions, _ = self.rpn_head.propose(maps, self.style.scale, self.style.ratios, height, width)
         logits, residuals = self.roi_head.bbox_head(roi_features(maps[:4], regions, STRIDES))
         scales = residuals.new_tensor([0.1, 0.1, 0.2, 0.2])
         residuals = residuals.reshape(len(regions), -1, 4) * scales
