@@ -297,9 +297,21 @@ class DDQDetector(CheckpointDetector):
         }
 
     def find(self, image: Tensor, width: int, height: int) -> tuple[FloatArray, FloatArray, IntArray]:
-        """The best pairs of a query and a class, at most `MAX_BOXES`; see `CheckpointDetector.find`."""
+        """The best pairs of a query and a class; see `CheckpointDetector.find`."""
         scores, boxes = self.network(image)
-        best = scores.flatten().topk(min(MAX_BOXES, scores.numel()))
-        pixels = corners(boxes[best.indices // scores.shape[1]]).cpu().numpy() * np.tile([width, height], 2)
-        labels: IntArray = (best.indices % scores.shape[1]).cpu().numpy()
-        return pixels, best.values.cpu().numpy(), labels
+        return best_pairs(scores, boxes, width, height)
+
+
+def best_pairs(scores: Tensor, boxes: Tensor, width: int, height: int) -> tuple[FloatArray, FloatArray, IntArray]:
+    """Boxes in pixels, scores and labels of the best pairs of a query and a class, at most `MAX_BOXES`.
+
+    Args:
+        scores: (N, K).
+        boxes: (N, 4) ``cx cy w h`` in parts of the image.
+        width: of the image in pixels.
+        height: likewise.
+    """
+    best = scores.flatten().topk(min(MAX_BOXES, scores.numel()))
+    pixels = corners(boxes[best.indices // scores.shape[1]]).cpu().numpy() * np.tile([width, height], 2)
+    labels: IntArray = (best.indices % scores.shape[1]).cpu().numpy()
+    return np.clip(pixels, 0, np.tile([width, height], 2)), best.values.cpu().numpy(), labels
