@@ -85,7 +85,7 @@ class FrameDetector(Protocol):
         ...
 
 
-def cloud_request(detector: LidarDetector) -> CloudRequest:
+def cloud_request(detector: LidarDetector | FrameDetector) -> CloudRequest:
     """What cloud a detector asks for: its attribute ``cloud``, or the plain scan."""
     request = getattr(detector, "cloud", None)
     return request if isinstance(request, CloudRequest) else SCAN

@@ -45,6 +45,10 @@ class DetectorOnFrames:
         """
         return self.detector.detect_frame(frame)
 
+    def notes(self, frame: Frame) -> tuple[str, ...]:
+        """What the frame lacks of the cloud that the detector was trained on."""
+        return missing_of(frame, cloud_request(self.detector))
+
 
 class CameraOnImages:
     """A camera detector, run on the frames' images."""

@@ -8,7 +8,7 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from lcf3d.detectors.fusion import bevfusion, mvxnet, view_transform  # noqa: E402
-from lcf3d.detectors.fusion.images import image_of, points_in_image  # noqa: E402
+from lcf3d.detectors.fusion.images import image_of  # noqa: E402
 from lcf3d.errors import ConfigError, DatasetError, DetectorError, ShapeError  # noqa: E402
 from lcf3d.structures import Camera, Frame  # noqa: E402
 
@@ -33,9 +33,6 @@ class Fake(torch.nn.Module):
 
 
 class TestImages:
-    def test_points_seen(self):
-        assert points_in_image(POINTS, camera()).tolist() == [True, True, False, False]
-
     def test_an_image_of_another_size_is_refused(self):
         wrong = Frame("f", POINTS, [camera()], {"left": np.zeros((10, 10, 3), np.uint8)})
         with pytest.raises(ShapeError, match=r"must have shape \(192, 640, 3\).*got \(10, 10, 3\)"):

@@ -13,6 +13,7 @@ from typing_extensions import Self
 
 from lcf3d.detectors.base import Image
 from lcf3d.detectors.classes import COCO_CLASSES, to_classes
+from lcf3d.detectors.downloads import local_path
 from lcf3d.detectors.lidar.fusing import fuse_batch_norm
 from lcf3d.detectors.resizing import fitted_size, resize_bilinear
 from lcf3d.errors import ConfigError, DetectorError, ShapeError
@@ -31,7 +32,7 @@ class CheckpointDetector(ABC):
     """A camera detector from a checkpoint file; a `CameraDetector`.
 
     Args:
-        path: checkpoint file; no code in it is executed.
+        path: checkpoint file, of which no code is executed, or the name of a published one, downloaded at first use.
         class_names: classes the detections shall have, mapped by name; the network's own without it.
         score_threshold: boxes need a higher score.
         classes: the checkpoint's own classes, comma-separated, where they are not COCO's 80 or KITTI's 3.
@@ -57,7 +58,7 @@ class CheckpointDetector(ABC):
         classes: str = "",
         device: str = "cpu",
     ) -> None:
-        self._setup(read_state_dict(Path(path)), class_names, score_threshold, classes, device)
+        self._setup(read_state_dict(local_path(str(path), "camera")), class_names, score_threshold, classes, device)
 
     @classmethod
     def from_state_dict(cls, state: Mapping[str, Any], **options: Any) -> Self:

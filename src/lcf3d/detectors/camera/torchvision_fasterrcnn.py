@@ -125,9 +125,13 @@ class FasterRCNNNetwork(nn.Module):
         pyramid: list[Tensor] = self.neck(self.backbone(image))
         return pyramid
 
+    def propose(self, maps: Sequence[Tensor], height: int, width: int) -> Tensor:
+        """(R, 4) at most 1,000 regions in pixels, best first."""
+        return self.rpn_head.propose(maps, self.style.scale, self.style.ratios, height, width)[0]
+
     def forward(self, maps: Sequence[Tensor], height: int, width: int) -> tuple[Tensor, Tensor]:
         """(R, K) scores and (R, K, 4) boxes of the regions of an image of height x width pixels, from its `maps`."""
-        regions, _ = self.rpn_head.propose(maps, self.style.scale, self.style.ratios, height, width)
+        regions = self.propose(maps, height, width)
         logits, residuals = self.roi_head.bbox_head(roi_features(maps[:4], regions, STRIDES))
         scales = residuals.new_tensor([0.1, 0.1, 0.2, 0.2])
         residuals = residuals.reshape(len(regions), -1, 4) * scales

@@ -8,26 +8,28 @@ sibling, whose checkpoints load. They live in the raw LIDAR_TOP frame of nuScene
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 import PIL.Image
 from numpy.typing import NDArray
 
-from lcf3d.detectors.base import Image
+from lcf3d.detectors.base import CloudRequest, Image
+from lcf3d.detectors.downloads import local_path
 from lcf3d.detectors.fusion import view_transform
 from lcf3d.detectors.fusion.detector import Arrays, FusionDetector, filled
 from lcf3d.detectors.fusion.images import image_of
 from lcf3d.detectors.fusion.transfusion import TransFusionHead, decode_queries
 from lcf3d.detectors.fusion.view_transform import IMAGE_SHAPE, DepthViewTransform
 from lcf3d.detectors.lidar.config import CHANNELS, VoxelSpec
+from lcf3d.detectors.lidar.frames import canonical_boxes, turned_points
 from lcf3d.detectors.lidar.necks import SecondFPN
 from lcf3d.detectors.lidar.sparse_encoders import SparseEncoder, sparse_shape
+from lcf3d.detectors.lidar.sweeps import cloud_of
 from lcf3d.detectors.lidar.voxelization import in_area, select_channels, voxelize
 from lcf3d.detectors.lidar.voxels import voxel_backbone
 from lcf3d.errors import DatasetError, DetectorError
-from lcf3d.geometry.boxes import canonical_from_mmdet3d, wrap_angle
+from lcf3d.geometry.boxes import canonical_from_mmdet3d
 from lcf3d.networks.checkpoints import read_state_dict
 from lcf3d.networks.convolution import ConvModule
 from lcf3d.networks.swin import SwinTransformer
@@ -141,6 +143,7 @@ class BEVFusion(FusionDetector):
     """
 
     network_classes: ClassVar[tuple[str, ...]] = CLASSES
+    cloud = CloudRequest(sweeps=9, remove_close=True, repeat_scan=True)
 
     @classmethod
     def from_state_dict(cls, state: Mapping[str, Any], **options: Any) -> BEVFusion:
@@ -163,9 +166,7 @@ class BEVFusion(FusionDetector):
         Raises:
             DatasetError: the network has a camera branch and the frame no image.
         """
-        assert frame.points is not None
-        points = select_channels(frame.points, CHANNELS)
-        points[:, 0], points[:, 1] = -points[:, 1], points[:, 0].copy()
+        points = turned_points(select_channels(cloud_of(frame, self.cloud), CHANNELS), "lidar_top")
         points = in_area(points, VOXELS.area)
         voxels = voxelize(points, VOXELS)
         cameras = [camera for camera in frame.cameras if camera.name in frame.images]
@@ -183,11 +184,8 @@ class BEVFusion(FusionDetector):
         """Detections in the LiDAR frame from the values of the queries."""
         arrays = {name: value.cpu().numpy() for name, value in maps.items()}
         boxes, scores, labels = decode_queries(arrays, self.score_threshold)
-        canonical = canonical_from_mmdet3d(boxes)
-        canonical[:, 0], canonical[:, 1] = boxes[:, 1], -boxes[:, 0]
-        canonical[:, 6] = wrap_angle(canonical[:, 6] - np.pi / 2)
-        velocities = np.stack([boxes[:, 8], -boxes[:, 7]], axis=1)
-        return Detections3D(canonical, scores, labels, CLASSES, velocities)
+        boxes = canonical_boxes(boxes, "lidar_top")
+        return Detections3D(canonical_from_mmdet3d(boxes), scores, labels, CLASSES, boxes[:, 7:])
 
 
 def camera_inputs(frame: Frame, cameras: Sequence[Camera], points: NDArray[np.float32]) -> Arrays:
@@ -250,10 +248,10 @@ def _height_first(weight: Tensor) -> Tensor:
 def bevfusion(
     path: str, class_names: Sequence[str] | None = None, score_threshold: float = 0.0, device: str = "cpu"
 ) -> BEVFusion:
-    """``bevfusion:CHECKPOINT``: BEVFusion, with or without cameras, from a checkpoint file; settings as of `BEVFusion`.
+    """``bevfusion:CHECKPOINT``: BEVFusion, with or without cameras, from a file or a published one by its name.
 
     Raises:
         DetectorError: the file cannot be read, or holds another network.
     """
     options = {"class_names": class_names, "score_threshold": score_threshold, "device": device}
-    return BEVFusion.from_state_dict(read_state_dict(Path(path)), **options)
+    return BEVFusion.from_state_dict(read_state_dict(local_path(path, "lidar")), **options)

@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 
 from numpy.typing import NDArray
 
+from lcf3d.detectors.base import SCAN, CloudRequest
 from lcf3d.detectors.classes import class_mapping
 from lcf3d.detectors.lidar.detector import channels_innermost
 from lcf3d.detectors.lidar.fusing import fuse_batch_norm
@@ -36,6 +37,7 @@ class FusionDetector(ABC):
     """
 
     network_classes: ClassVar[tuple[str, ...]]
+    cloud: CloudRequest = SCAN
 
     def __init__(
         self,

@@ -1,14 +1,10 @@
-"""What a network makes of a camera's image before its first layer; numpy only."""
+"""The image of a camera, where it is there and fits its calibration."""
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
-
 from lcf3d.detectors.base import Image
 from lcf3d.errors import DatasetError, ShapeError
-from lcf3d.geometry.camera import project_points
-from lcf3d.structures import BoolArray, Camera, Frame
+from lcf3d.structures import Camera, Frame
 
 
 def image_of(frame: Frame, camera: Camera) -> Image:
@@ -27,11 +23,3 @@ def image_of(frame: Frame, camera: Camera) -> Image:
             f"{(camera.height, camera.width, 3)} as its calibration says, got {image.shape}"
         )
     return image
-
-
-def points_in_image(points: NDArray[np.floating], camera: Camera) -> BoolArray:
-    """(N,) whether each of the (N, 3 or more) points is seen by the camera (what OpenMMLab's KITTI training keeps)."""
-    pixels, _ = project_points(points, camera)
-    u, v = pixels.T
-    inside: BoolArray = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
-    return inside

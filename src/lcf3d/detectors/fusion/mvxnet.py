@@ -10,15 +10,15 @@ from __future__ import annotations
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lcf3d.detectors.base import Image
+from lcf3d.detectors.downloads import local_path
 from lcf3d.detectors.fusion.detector import Arrays, FusionDetector, filled
-from lcf3d.detectors.fusion.images import image_of, points_in_image
+from lcf3d.detectors.fusion.images import image_of
 from lcf3d.detectors.lidar.detector import to_arrays
 from lcf3d.detectors.lidar.encoders import pillar_maximum
 from lcf3d.detectors.lidar.heads import AnchorHead, AnchorMaps
@@ -27,6 +27,7 @@ from lcf3d.detectors.lidar.necks import SecondFPN
 from lcf3d.detectors.lidar.presets import SECOND_KITTI
 from lcf3d.detectors.lidar.sparse_encoders import SparseEncoder, sparse_shape
 from lcf3d.detectors.lidar.suppression import NmsMode, suppression_threshold
+from lcf3d.detectors.lidar.sweeps import in_view
 from lcf3d.detectors.lidar.voxelization import decorate, voxelize
 from lcf3d.detectors.lidar.voxels import voxel_backbone
 from lcf3d.detectors.resizing import fitted_size, resize_bilinear
@@ -197,7 +198,7 @@ class MVXNet(FusionDetector):
         image = image_of(frame, camera)
         points = frame.points
         assert points is not None
-        voxels = voxelize(network_points(points[points_in_image(points, camera)], CONFIG), CONFIG.voxels)
+        voxels = voxelize(network_points(in_view(points, camera), CONFIG), CONFIG.voxels)
         if not len(voxels):
             return None
         width, height = camera.width, camera.height
@@ -251,10 +252,10 @@ def mvxnet(
     device: str = "cpu",
     camera: str = "left",
 ) -> MVXNet:
-    """``mvxnet:CHECKPOINT``: MVX-Net from a checkpoint file; settings as of `MVXNet`.
+    """``mvxnet:CHECKPOINT``: MVX-Net from a file, or a published one by its name; settings as of `MVXNet`.
 
     Raises:
         DetectorError: the file cannot be read, or holds another network.
     """
     options = {"nms": nms, "score_threshold": score_threshold, "device": device, "camera": camera}
-    return MVXNet.from_state_dict(read_state_dict(Path(path)), class_names=class_names, **options)
+    return MVXNet.from_state_dict(read_state_dict(local_path(path, "lidar")), class_names=class_names, **options)
