@@ -9,6 +9,7 @@ torch = pytest.importorskip("torch")
 
 from lcf3d.detectors.fusion import bevfusion, mvxnet, view_transform  # noqa: E402
 from lcf3d.detectors.fusion.images import image_of  # noqa: E402
+from lcf3d.distortion import Distortion  # noqa: E402
 from lcf3d.errors import ConfigError, DatasetError, DetectorError, ShapeError  # noqa: E402
 from lcf3d.structures import Camera, Frame  # noqa: E402
 
@@ -37,6 +38,12 @@ class TestImages:
         wrong = Frame("f", POINTS, [camera()], {"left": np.zeros((10, 10, 3), np.uint8)})
         with pytest.raises(ShapeError, match=r"must have shape \(192, 640, 3\).*got \(10, 10, 3\)"):
             image_of(wrong, camera())
+
+    def test_a_lens_is_refused(self):
+        plain = camera()
+        bent = Camera("left", plain.projection, CAMERA_FROM_LIDAR, 640, 192, Distortion("brown_conrady", (0.1, 0, 0, 0)))
+        with pytest.raises(ConfigError, match="brown_conrady distortion of camera 'left'; undistort"):
+            image_of(frame([bent]), bent)
 
 
 class TestMVXNet:
