@@ -41,7 +41,8 @@ class TestImages:
 
     def test_a_lens_is_refused(self):
         plain = camera()
-        bent = Camera("left", plain.projection, CAMERA_FROM_LIDAR, 640, 192, Distortion("brown_conrady", (0.1, 0, 0, 0)))
+        lens = Distortion("brown_conrady", (0.1, 0, 0, 0))
+        bent = Camera("left", plain.projection, CAMERA_FROM_LIDAR, 640, 192, lens)
         with pytest.raises(ConfigError, match="brown_conrady distortion of camera 'left'; undistort"):
             image_of(frame([bent]), bent)
 
