@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from lcf3d.datasets.kitti import KittiDataset
     from lcf3d.datasets.nuscenes import NuscenesDataset
     from lcf3d.datasets.opening import open_dataset
+    from lcf3d.detectors.classes import to_classes
     from lcf3d.detectors.named import load_detector
     from lcf3d.evaluation.domain_shift import DOMAINS, adapt_points
     from lcf3d.evaluation.generalization import evaluate_generalization
@@ -81,6 +82,7 @@ _LAZY = {
     "read_run": "api",
     "run": "api",
     "self_calibrate": "fusion.self_calibration",
+    "to_classes": "detectors.classes",
     "write_detections_2d": "formats.plain",
     "write_detections_3d": "formats.plain",
     "write_kitti": "datasets.convert",
@@ -130,6 +132,7 @@ __all__ = [
     "read_run",
     "run",
     "self_calibrate",
+    "to_classes",
     "write_detections_2d",
     "write_detections_3d",
     "write_kitti",

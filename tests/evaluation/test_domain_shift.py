@@ -12,11 +12,12 @@ from lcf3d.cli.app import app, main
 from lcf3d.datasets.convert import write_nuscenes
 from lcf3d.datasets.kitti import KittiDataset
 from lcf3d.datasets.nuscenes import NuscenesDataset
-from lcf3d.errors import ConfigError, ShapeError
+from lcf3d.errors import ConfigError, DatasetError, ShapeError
 from lcf3d.evaluation.domain_report import best_cells, charts, html_report
 from lcf3d.evaluation.domain_shift import (
     DOMAINS,
     IOU_THRESHOLDS,
+    AdaptedFrames,
     AdaptedLidar,
     adapt_points,
     ap_over_iou,
@@ -29,6 +30,7 @@ from lcf3d.evaluation.domain_shift import (
 from lcf3d.evaluation.domain_tasks import DomainTask, DomainTaskRunner, parse_task
 from lcf3d.evaluation.svg import PALETTE
 from lcf3d.fusion.config import FusionConfig
+from lcf3d.geometry.camera import project_points
 from lcf3d.structures import KITTI_CLASSES, NUSCENES_CLASSES, Detections3D, Frame
 from tests.datasets.kitti_folder import OBJECTS, make_kitti, make_results
 from tests.fusion.scenes import camera
@@ -94,6 +96,24 @@ def test_boxes_of_an_adapted_detector_are_in_the_frames_coordinates() -> None:
     source = AdaptedLidar(detector, NUSCENES, KITTI, "left")
     found = source.detect(Frame("f", scan, [camera()]))
     np.testing.assert_allclose(found.boxes[0, :3], [10, 0, 0.5], atol=1e-6)
+
+
+def test_a_detector_of_frames_sees_points_where_they_were_in_the_image() -> None:
+    """The LiDAR frame moves to the height of training, the cameras stay: pixels of points do not change."""
+    scan = np.array([[10, 0, 0.5, 255], [12, 1, 0.2, 51]], dtype=np.float32)
+    given = Frame("f", scan, [camera()])
+
+    class Detector:
+        def detect_frame(self, frame):
+            np.testing.assert_allclose(frame.points[:, 3], [1, 0.2], rtol=1e-6)
+            seen, seen_before = (project_points(f.points[:, :3], f.camera("left"))[0] for f in (frame, given))
+            np.testing.assert_allclose(seen, seen_before, atol=1e-3)
+            return boxes([[*frame.points[0, :3], 1, 1, 1, 0]], [0])
+
+    found = AdaptedFrames(Detector(), NUSCENES, KITTI, "left").detect(given)
+    np.testing.assert_allclose(found.boxes[0, :3], [10, 0, 0.5], atol=1e-6)
+    with pytest.raises(DatasetError, match="no scan"):
+        AdaptedFrames(Detector(), NUSCENES, KITTI, "left").detect(Frame("f", None, [camera()]))
 
 
 def test_domains_by_the_beginning_of_a_name() -> None:

@@ -12,7 +12,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from lcf3d.structures import Detections2D, Detections3D
+from lcf3d.structures import Detections2D, Detections3D, Frame
 
 Image = NDArray[np.uint8]
 
@@ -70,7 +70,22 @@ class LidarDetector(Protocol):
         ...
 
 
-def cloud_request(detector: LidarDetector) -> CloudRequest:
+class FrameDetector(Protocol):
+    """A detector of points and images together, which may stand where the LiDAR branch stands."""
+
+    def detect_frame(self, frame: Frame) -> Detections3D:
+        """Detect objects in one frame.
+
+        Args:
+            frame: with a scan, images and calibrated cameras.
+
+        Returns:
+            3D boxes in the LiDAR frame.
+        """
+        ...
+
+
+def cloud_request(detector: LidarDetector | FrameDetector) -> CloudRequest:
     """What cloud a detector asks for: its attribute ``cloud``, or the plain scan."""
     request = getattr(detector, "cloud", None)
     return request if isinstance(request, CloudRequest) else SCAN

@@ -61,8 +61,12 @@ class PublishedModel:
         return self.sha256 or (found.group(1) if found else "")
 
 
+KINDS = ("pointpillars", "second", "part-a2", "pv-rcnn", "ssn", "centerpoint", "mvxnet", "bevfusion")
+"""Kinds of ``--lidar`` that load OpenMMLab's files; a file is named after its kind."""
+
+
 def _model(name: str, path: str, row: str, scores: str) -> PublishedModel:
-    kind = next(k for k in ("pointpillars", "second", "part-a2", "pv-rcnn", "ssn", "centerpoint") if name.startswith(k))
+    kind = next(k for k in KINDS if name.startswith(k))
     data = "nuScenes" if "nuscenes" in name else "KITTI"
     licence = f"Apache-2.0; trained on {data}, which is for non-commercial use"
     return PublishedModel(name, _ROOT + path, row, scores, use=f"--lidar {kind}:{name}", licence=licence)
@@ -95,6 +99,12 @@ def _mask_rcnn(name: str, path: str, scores: str) -> PublishedModel:
         "Apache-2.0; trained on nuImages, which is for non-commercial use",
         note="nuScenes' ten classes, with masks",
     )
+
+
+def _coco(name: str, kind: str, path: str, scores: str) -> PublishedModel:
+    url = f"https://download.openmmlab.com/mmdetection/{path}"
+    note = "COCO's 80 classes"
+    return PublishedModel(name, url, "", scores, "camera", f"--camera {kind}:{name}", "Apache-2.0", note=note)
 
 
 _AUTHORS = "trained by the LCF3D authors; no public address is known here: pass the path of your file"
@@ -185,6 +195,38 @@ PUBLISHED: tuple[PublishedModel, ...] = (
         "nuScenes: CenterPoint (by its scores)",
         "nuScenes mAP 56.11, NDS 64.61",
     ),
+    _model(
+        "mvxnet-kitti",
+        "v1.1.0_models/mvxnet/mvxnet_fpn_dv_second_secfpn_8xb2-80e_kitti-3d-3class/"
+        "mvxnet_fpn_dv_second_secfpn_8xb2-80e_kitti-3d-3class-8963258a.pth",
+        "KITTI: MVXNet",
+        "KITTI moderate mAP 63.5",
+    ),
+    _model(
+        "bevfusion-lidar-nuscenes",
+        "v1.1.0_models/bevfusion/bevfusion_lidar_voxel0075_second_secfpn_8xb4-cyclic-20e_nus-3d-2628f933.pth",
+        "",
+        "nuScenes mAP 64.9",
+    ),
+    _model(
+        "bevfusion-nuscenes",
+        "v1.1.0_models/bevfusion/bevfusion_lidar-cam_voxel0075_second_secfpn_8xb4-cyclic-20e_nus-3d-5239b1af.pth",
+        "domain generalization: BEVFusion",
+        "nuScenes mAP 68.6",
+    ),
+    _coco(
+        "ddq-detr-r50-coco",
+        "ddq",
+        "v3.0/ddq/ddq-detr-4scale_r50_8xb2-12e_coco/ddq-detr-4scale_r50_8xb2-12e_coco_20230809_170711-42528127.pth",
+        "COCO AP 51.4",
+    ),
+    _coco("ddq-detr-swinl-coco", "ddq", "v3.0/ddq/ddq_detr_swinl_30e.pth", "COCO AP 58.7"),
+    _coco(
+        "detectors-cascade-r50-coco",
+        "detectors",
+        "v2.0/detectors/detectors_cascade_rcnn_r50_1x_coco/detectors_cascade_rcnn_r50_1x_coco-32a10ba0.pth",
+        "COCO AP 47.4",
+    ),
     _yolox("nano", "COCO AP 25.8", "c789161ed43c8269fcd4e67c67eeeb4e80c622da2eb296a20bc6007bd18a0b7d", 3_659_407),
     _yolox("tiny", "COCO AP 32.8", "427cc366d34e27ff7a03e2899b5e3671425c262ea2291f88bb942bc1cc70b0f7", 20_219_662),
     _yolox("s", "COCO AP 40.5", "c5c2d13e59ae883e6af3b45daea64af4833a4951c92d116ec270d9ddbe998063", 35_858_002),
@@ -222,7 +264,7 @@ PUBLISHED: tuple[PublishedModel, ...] = (
         "",
         "nuScenes: DDQ-DETR",
         sensor="camera",
-        use="--camera mmdet:CONFIG,FILE",
+        use="--camera ddq:FILE",
         note=_AUTHORS,
     ),
     PublishedModel(

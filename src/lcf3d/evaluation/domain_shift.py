@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lcf3d.datasets.convert import kitti_labels
-from lcf3d.detectors.base import LidarDetector
+from lcf3d.detectors.base import FrameDetector, LidarDetector
 from lcf3d.errors import ConfigError, DatasetError, ShapeError
 from lcf3d.evaluation.generalization import (
     CLASS_RANGES,
@@ -150,6 +150,42 @@ class AdaptedLidar:
         found = self.detector(points)
         boxes = found.boxes.copy()
         boxes[:, 2] -= height_shift_m(self.tested, self.trained)
+        return replace(found, boxes=boxes)
+
+
+class AdaptedFrames:
+    """A detector of points and images of one domain run on frames of another, as `AdaptedLidar` does with points.
+
+    Args:
+        detector: the detector.
+        tested: domain of the frames.
+        trained: domain of the detector.
+        camera: name of the front camera.
+    """
+
+    def __init__(self, detector: FrameDetector, tested: SensorDomain, trained: SensorDomain, camera: str) -> None:
+        self.detector = detector
+        self.tested = tested
+        self.trained = trained
+        self.camera = camera
+
+    def detect(self, frame: Frame) -> Detections3D:
+        """Run the detector.
+
+        Raises:
+            DatasetError: the frame lacks a scan or images.
+        """
+        if frame.points is None:
+            raise DatasetError(f"frame {frame.id} has no scan for the detector; give lidar=results:PATH instead")
+        shift = height_shift_m(self.tested, self.trained)
+        points = adapt_points(frame.points, self.tested, self.trained, frame.camera(self.camera))
+        # the cameras stay where they are while the LiDAR frame moves
+        frame_from_moved = np.eye(4)
+        frame_from_moved[2, 3] = -shift
+        cameras = [replace(c, camera_from_lidar=c.camera_from_lidar @ frame_from_moved) for c in frame.cameras]
+        found = self.detector.detect_frame(Frame(frame.id, points, cameras, frame.images))
+        boxes = found.boxes.copy()
+        boxes[:, 2] -= shift
         return replace(found, boxes=boxes)
 
 

@@ -11,6 +11,7 @@ from lcf3d.datasets.opening import named, open_dataset
 from lcf3d.errors import ConfigError, DatasetError
 from lcf3d.evaluation.domain_shift import (
     LABEL_CLASSES,
+    AdaptedFrames,
     AdaptedLidar,
     ShiftMetrics,
     Truth,
@@ -23,7 +24,7 @@ from lcf3d.evaluation.domain_shift import (
 from lcf3d.fusion.config import FusionConfig
 from lcf3d.fusion.pipeline import LateCascadeFusion
 from lcf3d.run.setup import find_calibration
-from lcf3d.run.sources import LidarOnScans, open_cameras, open_lidar
+from lcf3d.run.sources import DetectorOnFrames, LidarOnScans, open_cameras, open_lidar
 from lcf3d.structures import KITTI_CLASSES, NUSCENES_CLASSES, Camera, Detections2D, Detections3D, Frame
 
 FRONT = {"kitti": "left", "nuscenes": "CAM_FRONT"}
@@ -209,8 +210,11 @@ class DomainTaskRunner:
 
     def _lidar(self, text: str) -> LidarSource:
         source = open_lidar(text, self.dataset, self._names(text.partition(":")[0]))
+        domains = find_domain(self.kind), find_domain(self.task.trained)
         if isinstance(source, LidarOnScans):
-            return AdaptedLidar(source.detector, find_domain(self.kind), find_domain(self.task.trained), self.front)
+            return AdaptedLidar(source.detector, *domains, self.front)
+        if isinstance(source, DetectorOnFrames):
+            return AdaptedFrames(source.detector, *domains, self.front)
         return source
 
     def _camera(self, text: str) -> CameraSource:

@@ -9,10 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from lcf3d.detectors.lidar.backbones import ConvModule
 from lcf3d.detectors.lidar.point_ops import ball_query, farthest_point_sampling, three_nn_interpolation
 from lcf3d.localizers.pointnet import FrustumOutputs
 from lcf3d.localizers.spec import LocalizerSpec
+from lcf3d.networks.convolution import ConvModule
 from lcf3d.networks.torch import Tensor, functional, nn, torch
 
 EPS = 1e-5

@@ -14,7 +14,7 @@ from lcf3d.datasets.base import CameraSource, Dataset, LidarSource
 from lcf3d.errors import DatasetError
 from lcf3d.provenance import FusedDetections, Outcome, Reason
 from lcf3d.run.folder import RunFolder
-from lcf3d.run.sources import LidarOnScans
+from lcf3d.run.sources import DetectorOnFrames, LidarOnScans
 from lcf3d.structures import Detections2D, Detections3D, Frame
 
 
@@ -90,7 +90,7 @@ class FrameRunner:
             for name in self.cameras
             if name not in there
         ]
-        if isinstance(self.lidar, LidarOnScans):
+        if isinstance(self.lidar, (LidarOnScans, DetectorOnFrames)):
             notes += self.lidar.notes(frame)
         return replace(fused, notes=(*fused.notes, *notes)) if notes else fused
 

@@ -21,7 +21,7 @@ from lcf3d.localizers.named import load_localizer
 from lcf3d.run.folder import RunFolder
 from lcf3d.run.frames import FrameRunner
 from lcf3d.run.settings import build_config
-from lcf3d.run.sources import CameraOnImages, LidarOnScans, open_cameras, open_lidar
+from lcf3d.run.sources import CameraOnImages, DetectorOnFrames, LidarOnScans, open_cameras, open_lidar
 
 log = logging.getLogger(__name__)
 
@@ -249,7 +249,7 @@ def find_calibration(
     """
     if wanted != "auto":
         return load_calibration(wanted)
-    if isinstance(lidar, LidarOnScans):
+    if isinstance(lidar, (LidarOnScans, DetectorOnFrames)):
         return None
     low, high = _score_range(dataset, frame_ids, lidar)
     probabilities = low >= 0 and high <= 1

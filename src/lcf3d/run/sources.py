@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from lcf3d.datasets.base import CameraSource, Dataset, LidarSource
-from lcf3d.detectors.base import CameraDetector, LidarDetector, cloud_request
+from lcf3d.detectors.base import CameraDetector, FrameDetector, LidarDetector, cloud_request
 from lcf3d.detectors.lidar.sweeps import cloud_of, missing_of
 from lcf3d.detectors.named import load_detector
 from lcf3d.structures import Detections2D, Detections3D, Frame
@@ -25,6 +25,25 @@ class LidarOnScans:
             DatasetError: the frame has no scan.
         """
         return self.detector(cloud_of(frame, cloud_request(self.detector)))
+
+    def notes(self, frame: Frame) -> tuple[str, ...]:
+        """What the frame lacks of the cloud that the detector was trained on."""
+        return missing_of(frame, cloud_request(self.detector))
+
+
+class DetectorOnFrames:
+    """A detector of points and images together, run on whole frames where a LiDAR branch stands."""
+
+    def __init__(self, detector: FrameDetector) -> None:
+        self.detector = detector
+
+    def detect(self, frame: Frame) -> Detections3D:
+        """Run the detector.
+
+        Raises:
+            DatasetError: the frame lacks a scan or images.
+        """
+        return self.detector.detect_frame(frame)
 
     def notes(self, frame: Frame) -> tuple[str, ...]:
         """What the frame lacks of the cloud that the detector was trained on."""
@@ -53,6 +72,8 @@ def open_lidar(text: str, dataset: Dataset, class_names: Sequence[str], missing:
         Lcf3dError: there is no such detector, or it cannot be loaded.
     """
     loaded: Any = load_detector(text, "lidar", class_names, {"missing": missing}, dataset)
+    if hasattr(loaded, "detect_frame"):
+        return DetectorOnFrames(loaded)
     return loaded if hasattr(loaded, "detect") else LidarOnScans(loaded)
 
 

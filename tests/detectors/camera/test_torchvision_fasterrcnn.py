@@ -63,7 +63,7 @@ def test_the_original_maps(shared, name):
             check(f"rpn_head.{kind}.{i}", value)
     # the scores of both stages are 1 in float32: which regions of equal score come first is not defined
     height, width = data["input"].shape[:2]
-    pooled = roi_features(maps[:4], network.regions(maps, height, width), (4, 8, 16, 32))
+    pooled = roi_features(maps[:4], network.propose(maps, height, width), (4, 8, 16, 32))
     expected = info["maps"]["roi_head.bbox_roi_extractor"]
     assert list(pooled.shape) == expected["shape"]
     assert float(pooled.std()) == pytest.approx(expected["std"], rel=0.01)

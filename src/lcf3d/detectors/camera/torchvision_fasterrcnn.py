@@ -33,62 +33,12 @@ from lcf3d.detectors.classes import to_classes
 from lcf3d.detectors.downloads import local_path
 from lcf3d.errors import ConfigError, ShapeError
 from lcf3d.networks.checkpoints import load_parameters, read_notes, read_state_dict
+from lcf3d.networks.convolution import FeaturePyramid
+from lcf3d.networks.resnet import ResNet
 from lcf3d.networks.torch import Tensor, functional, nn, torch, torch_device, torchvision
 from lcf3d.structures import Detections2D
 
 STRIDES = (4, 8, 16, 32, 64)
-
-
-class _Named(nn.Module):
-    """A convolution under the name ``conv``."""
-
-    def __init__(self, in_channels: int, out_channels: int, kernel: int) -> None:
-        super().__init__()
-        self.conv = nn.Conv2d(in_channels, out_channels, kernel, padding=kernel // 2)
-
-    def forward(self, x: Tensor) -> Tensor:
-        """(N, in, H, W) -> (N, out, H, W)."""
-        return self.conv(x)
-
-
-class Backbone(nn.Module):
-    """torchvision's ResNet without its classifier."""
-
-    def __init__(self, depth: int, caffe: bool) -> None:
-        super().__init__()
-        resnet = getattr(torchvision().models, f"resnet{depth}")(weights=None)
-        for name in ("conv1", "bn1", "layer1", "layer2", "layer3", "layer4"):
-            setattr(self, name, getattr(resnet, name))
-        if caffe:
-            for layer in (self.layer2, self.layer3, self.layer4):
-                layer[0].conv1.stride, layer[0].conv2.stride = (2, 2), (1, 1)
-
-    def forward(self, image: Tensor) -> list[Tensor]:
-        """Maps of strides 4, 8, 16 and 32."""
-        x = functional.relu(self.bn1(self.conv1(image)))
-        x = functional.max_pool2d(x, 3, 2, 1)
-        maps = []
-        for layer in (self.layer1, self.layer2, self.layer3, self.layer4):
-            x = layer(x)
-            maps.append(x)
-        return maps
-
-
-class Neck(nn.Module):
-    """Feature pyramid (Lin et al., CVPR 2017); the fifth level is every second cell of the fourth."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.lateral_convs = nn.ModuleList([_Named(channels, 256, 1) for channels in (256, 512, 1024, 2048)])
-        self.fpn_convs = nn.ModuleList([_Named(256, 256, 3) for _ in range(4)])
-
-    def forward(self, maps: Sequence[Tensor]) -> list[Tensor]:
-        """Five maps of 256 channels at strides 4 to 64."""
-        sums = [conv(x) for conv, x in zip(self.lateral_convs, maps, strict=True)]
-        for i in range(3, 0, -1):
-            sums[i - 1] = sums[i - 1] + functional.interpolate(sums[i], size=sums[i - 1].shape[-2:], mode="nearest")
-        outputs = [conv(x) for conv, x in zip(self.fpn_convs, sums, strict=True)]
-        return [*outputs, functional.max_pool2d(outputs[-1], 1, 2)]
 
 
 class RPNHead(nn.Module):
@@ -105,18 +55,46 @@ class RPNHead(nn.Module):
         hidden = [functional.relu(self.rpn_conv(x)) for x in maps]
         return [self.rpn_cls(x) for x in hidden], [self.rpn_reg(x) for x in hidden]
 
+    def propose(
+        self, maps: Sequence[Tensor], scale: float, ratios: Sequence[float], height: int, width: int
+    ) -> tuple[Tensor, Tensor]:
+        """(R, 4) at most 1,000 regions in pixels, best first, and their (R,) objectness.
+
+        Args:
+            maps: of strides 4 to 64.
+            scale: side of the square anchor in strides.
+            ratios: height over width of the anchors.
+            height: of the image in pixels.
+            width: of the image in pixels.
+        """
+        boxes, scores, levels = [], [], []
+        for level, (logits, residuals) in enumerate(zip(*self(maps), strict=True)):
+            objectness = logits[0].permute(1, 2, 0).reshape(-1).sigmoid()
+            best = objectness.topk(min(1000, len(objectness))).indices
+            anchors = anchor_grid(logits.shape[-2:], STRIDES[level], scale, ratios)
+            flat = residuals[0].permute(1, 2, 0).reshape(-1, 4)
+            boxes.append(clip_boxes(decode_boxes(anchors.to(flat)[best], flat[best]), height, width))
+            scores.append(objectness[best])
+            levels.append(torch.full_like(best, level))
+        all_boxes, all_scores, all_levels = torch.cat(boxes), torch.cat(scores), torch.cat(levels)
+        sides = all_boxes[:, 2:] - all_boxes[:, :2]
+        valid = (sides > 0).all(dim=1)
+        all_boxes, all_scores, all_levels = all_boxes[valid], all_scores[valid], all_levels[valid]
+        kept = torchvision().ops.batched_nms(all_boxes, all_scores, all_levels, 0.7)[:1000]
+        return all_boxes[kept], all_scores[kept]
+
 
 class BoxHead(nn.Module):
-    """Class logits and class-wise residuals of each region."""
+    """Class logits and residuals of each region, class by class or (``agnostic``) one for all classes."""
 
-    def __init__(self, classes: int) -> None:
+    def __init__(self, classes: int, agnostic: bool = False) -> None:
         super().__init__()
         self.shared_fcs = nn.ModuleList([nn.Linear(256 * 49, 1024), nn.Linear(1024, 1024)])
         self.fc_cls = nn.Linear(1024, classes + 1)
-        self.fc_reg = nn.Linear(1024, classes * 4)
+        self.fc_reg = nn.Linear(1024, 4 if agnostic else classes * 4)
 
     def forward(self, pooled: Tensor) -> tuple[Tensor, Tensor]:
-        """(R, K + 1) logits, background last, and (R, 4 K) residuals, from (R, 256, 7, 7)."""
+        """(R, K + 1) logits, background last, and (R, 4 K or 4) residuals, from (R, 256, 7, 7)."""
         x = pooled.flatten(1)
         for layer in self.shared_fcs:
             x = functional.relu(layer(x))
@@ -137,36 +115,23 @@ class FasterRCNNNetwork(nn.Module):
     def __init__(self, depth: int, style: Style, masks: bool = False) -> None:
         super().__init__()
         self.style = style
-        self.backbone = Backbone(depth, style.caffe)
-        self.neck = Neck()
+        self.backbone = ResNet(depth, style.caffe)
+        self.neck = FeaturePyramid((256, 512, 1024, 2048), extra=True)
         self.rpn_head = RPNHead(len(style.ratios))
         self.roi_head = _RoIHead(len(style.classes), masks)
-
-    def regions(self, maps: Sequence[Tensor], height: int, width: int) -> Tensor:
-        """(R, 4) at most 1,000 proposals in pixels, best first."""
-        boxes, scores, levels = [], [], []
-        for level, (logits, residuals) in enumerate(zip(*self.rpn_head(maps), strict=True)):
-            objectness = logits[0].permute(1, 2, 0).reshape(-1).sigmoid()
-            best = objectness.topk(min(1000, len(objectness))).indices
-            anchors = anchor_grid(logits.shape[-2:], STRIDES[level], self.style.scale, self.style.ratios)
-            flat = residuals[0].permute(1, 2, 0).reshape(-1, 4)
-            boxes.append(clip_boxes(decode_boxes(anchors.to(flat)[best], flat[best]), height, width))
-            scores.append(objectness[best])
-            levels.append(torch.full_like(best, level))
-        all_boxes, all_scores, all_levels = torch.cat(boxes), torch.cat(scores), torch.cat(levels)
-        sides = all_boxes[:, 2:] - all_boxes[:, :2]
-        valid = (sides > 0).all(dim=1)
-        all_boxes, all_scores, all_levels = all_boxes[valid], all_scores[valid], all_levels[valid]
-        return all_boxes[torchvision().ops.batched_nms(all_boxes, all_scores, all_levels, 0.7)[:1000]]
 
     def maps(self, image: Tensor) -> list[Tensor]:
         """The feature pyramid of a padded (1, 3, H, W) image."""
         pyramid: list[Tensor] = self.neck(self.backbone(image))
         return pyramid
 
+    def propose(self, maps: Sequence[Tensor], height: int, width: int) -> Tensor:
+        """(R, 4) at most 1,000 regions in pixels, best first."""
+        return self.rpn_head.propose(maps, self.style.scale, self.style.ratios, height, width)[0]
+
     def forward(self, maps: Sequence[Tensor], height: int, width: int) -> tuple[Tensor, Tensor]:
         """(R, K) scores and (R, K, 4) boxes of the regions of an image of height x width pixels, from its `maps`."""
-        regions = self.regions(maps, height, width)
+        regions = self.propose(maps, height, width)
         logits, residuals = self.roi_head.bbox_head(roi_features(maps[:4], regions, STRIDES))
         scales = residuals.new_tensor([0.1, 0.1, 0.2, 0.2])
         residuals = residuals.reshape(len(regions), -1, 4) * scales

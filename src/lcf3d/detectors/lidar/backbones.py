@@ -13,21 +13,6 @@ def conv_bn_relu(conv: nn.Module, channels: int, eps: float = 1e-3) -> list[nn.M
     return [conv, nn.BatchNorm2d(channels, eps=eps, momentum=0.01), nn.ReLU(inplace=True)]
 
 
-class ConvModule(nn.Module):
-    """Convolution, batch normalization, ReLU under the names ``conv`` and ``bn``."""
-
-    def __init__(
-        self, in_channels: int, out_channels: int, kernel: int, stride: int = 1, eps: float = 1e-3, bias: bool = False
-    ) -> None:
-        super().__init__()
-        self.conv = nn.Conv2d(in_channels, out_channels, kernel, stride, kernel // 2, bias=bias)
-        self.bn = nn.BatchNorm2d(out_channels, eps=eps, momentum=0.01)
-
-    def forward(self, x: Tensor) -> Tensor:
-        """(N, in, H, W) -> (N, out, H / stride, W / stride)."""
-        return functional.relu(self.bn(self.conv(x)))
-
-
 class SecondBackbone(nn.Module):
     """The plain convolutional backbone of SECOND and PointPillars: blocks of 3 x 3 convolutions.
 

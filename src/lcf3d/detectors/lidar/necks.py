@@ -5,8 +5,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from lcf3d.detectors.lidar.backbones import ConvModule, conv_bn_relu
-from lcf3d.networks.torch import Tensor, functional, nn, torch
+from lcf3d.detectors.lidar.backbones import conv_bn_relu
+from lcf3d.networks.torch import Tensor, nn, torch
 
 
 class SecondFPN(nn.Module):
@@ -39,20 +39,3 @@ class SecondFPN(nn.Module):
     def forward(self, maps: Sequence[Tensor]) -> list[Tensor]:
         """One map of ``sum(channels)`` channels."""
         return [torch.cat([block(x) for block, x in zip(self.deblocks, maps, strict=True)], dim=1)]
-
-
-class FPN(nn.Module):
-    """Feature pyramid: each map, plus the enlarged sum of the coarser ones, convolved once more."""
-
-    def __init__(self, in_channels: Sequence[int], channels: int = 256) -> None:
-        super().__init__()
-        self.lateral_convs = nn.ModuleList([ConvModule(before, channels, 1) for before in in_channels])
-        self.fpn_convs = nn.ModuleList([ConvModule(channels, channels, 3) for _ in in_channels])
-
-    def forward(self, maps: Sequence[Tensor]) -> list[Tensor]:
-        """As many maps as came in, all of ``channels`` channels."""
-        sums = [conv(x) for conv, x in zip(self.lateral_convs, maps, strict=True)]
-        for i in range(len(sums) - 1, 0, -1):
-            enlarged = functional.interpolate(sums[i], size=sums[i - 1].shape[-2:], mode="nearest")
-            sums[i - 1] = sums[i - 1] + enlarged
-        return [conv(x) for conv, x in zip(self.fpn_convs, sums, strict=True)]

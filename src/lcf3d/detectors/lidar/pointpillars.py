@@ -9,8 +9,9 @@ from lcf3d.detectors.lidar.config import LidarConfig
 from lcf3d.detectors.lidar.detector import PillarDetector
 from lcf3d.detectors.lidar.encoders import HardVFE, PillarFeatureNet
 from lcf3d.detectors.lidar.heads import AnchorHead
-from lcf3d.detectors.lidar.necks import FPN, SecondFPN
+from lcf3d.detectors.lidar.necks import SecondFPN
 from lcf3d.detectors.lidar.pillars import PillarNetwork
+from lcf3d.networks.convolution import FeaturePyramid
 from lcf3d.networks.torch import nn
 
 
@@ -32,7 +33,8 @@ class PointPillars(PillarDetector):
         backbone = SecondBackbone(64, (64, 128, 256), layers=(3, 5, 5), strides=(2, 2, 2))
         if config.variant == "fpn":
             head = AnchorHead(256, config.anchors, classes)
-            return PillarNetwork(config, HardVFE(point_channels), backbone, FPN((64, 128, 256)), head)
-        neck = SecondFPN((64, 128, 256), (128, 128, 128), (1, 2, 4))
+            neck = FeaturePyramid((64, 128, 256), eps=1e-3, norm=True, relu=True)
+            return PillarNetwork(config, HardVFE(point_channels), backbone, neck, head)
+        deblocks = SecondFPN((64, 128, 256), (128, 128, 128), (1, 2, 4))
         head = AnchorHead(384, config.anchors, classes)
-        return PillarNetwork(config, PillarFeatureNet(point_channels), backbone, neck, head)
+        return PillarNetwork(config, PillarFeatureNet(point_channels), backbone, deblocks, head)

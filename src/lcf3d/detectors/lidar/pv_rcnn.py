@@ -8,7 +8,6 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from lcf3d.detectors.lidar.backbones import ConvModule
 from lcf3d.detectors.lidar.config import LidarConfig, VoxelSpec
 from lcf3d.detectors.lidar.decoding import detections, sigmoid
 from lcf3d.detectors.lidar.detector import TorchLidarDetector, to_arrays
@@ -23,6 +22,7 @@ from lcf3d.detectors.lidar.sparse_encoders import SparseEncoder, sparse_shape
 from lcf3d.detectors.lidar.suppression import bev_nms, suppression_threshold
 from lcf3d.detectors.lidar.voxelization import voxelize
 from lcf3d.detectors.lidar.voxels import voxel_backbone
+from lcf3d.networks.convolution import ConvModule
 from lcf3d.networks.torch import Tensor, nn, torch
 from lcf3d.structures import Detections3D
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from lcf3d.detectors.lidar.backbones import ConvModule
 from lcf3d.detectors.lidar.point_ops import ball_query
+from lcf3d.networks.convolution import ConvModule
 from lcf3d.networks.torch import Tensor, functional, nn, torch
 
 

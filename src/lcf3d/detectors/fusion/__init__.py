@@ -1,0 +1,1 @@
+"""Networks that take points and images at once: the systems that the late cascade is compared with."""
