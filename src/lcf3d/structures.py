@@ -12,6 +12,7 @@ Conventions (all of the package, converted only at its edges, see ``lcf3d.geomet
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -393,6 +394,12 @@ class Frame:
             if camera.name == name:
                 return camera
         raise ConfigError(f"frame {self.id} has no camera {name!r}; it has {[c.name for c in self.cameras]}")
+
+    def with_cameras(self, cameras: Sequence[Camera]) -> Frame:
+        """The same frame with other cameras; scan, images and labels are those of this one, read when asked for."""
+        frame = copy(self)
+        frame.cameras = tuple(cameras)
+        return frame
 
     def __repr__(self) -> str:
         return f"Frame({self.id!r}, cameras={[c.name for c in self.cameras]})"
