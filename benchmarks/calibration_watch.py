@@ -28,7 +28,7 @@ from lcf3d.formats.kitti import KittiFrames, objects_from_detections, read_folde
 from lcf3d.fusion.alignment import rotation_of
 from lcf3d.fusion.alignment_watch import AlignmentWatch, WatchSettings
 from lcf3d.fusion.self_calibration import self_calibrate
-from lcf3d.geometry.camera import project_boxes
+from lcf3d.run.folder import image_boxes
 from lcf3d.run.results import CameraResults, LidarResults
 from lcf3d.structures import Camera, Detections2D, Detections3D, FloatArray, Frame
 
@@ -47,16 +47,15 @@ def turned(camera: Camera, axis: str, degrees: float) -> Camera:
 
 
 def fuse(inputs: Inputs, config: FusionConfig) -> list[tuple[Detections3D, FloatArray]]:
-    """Boxes of all frames and their projections, scores calibrated without labels as ``lcf3d run`` does."""
+    """Boxes of all frames and where they are in the image, scores calibrated without labels as ``lcf3d run`` does."""
     fusion = LateCascadeFusion(
         config, calibration=self_calibrate(inputs[:: -(-len(inputs) // TEACHING_FRAMES)], config)
     )
     out = []
     for frame, lidar, camera in inputs:
-        found = fusion(frame, lidar, {"left": camera}).detections
-        projected, visible = project_boxes(found.boxes, frame.cameras[0])
-        # the watch turns camera_from_lidar; the result files keep the axes of the data set
-        out.append((found[visible], projected[visible]))
+        fused = fusion(frame, lidar, {"left": camera})
+        # the watch turns camera_from_lidar; result files keep the axes of the data set
+        out.append((fused.detections, image_boxes(frame, fused)))
     return out
 
 

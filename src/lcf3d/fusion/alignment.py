@@ -122,8 +122,7 @@ class Alignment:
     @property
     def deviation(self) -> FloatArray:
         """(9,) standard deviations of the state."""
-        deviation: FloatArray = np.sqrt(np.diag(self.covariance))
-        return deviation
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
 
     @property
     def time_offset(self) -> float:
@@ -146,8 +145,7 @@ class Alignment:
 
 def centre_offset(camera: Camera) -> FloatArray:
     """(3,) what to add to camera coordinates to count them from the camera's centre (``projection = K [I | t]``)."""
-    offset: FloatArray = np.linalg.solve(camera.intrinsics, camera.projection[:, 3])
-    return offset
+    return np.asarray(np.linalg.solve(camera.intrinsics, camera.projection[:, 3]), dtype=np.float64)
 
 
 def rotation_of(vector: FloatArray) -> FloatArray:
@@ -157,8 +155,7 @@ def rotation_of(vector: FloatArray) -> FloatArray:
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     if angle < 1e-8:
         return np.asarray(np.eye(3) + cross)
-    matrix: FloatArray = np.eye(3) + np.sin(angle) / angle * cross + (1 - np.cos(angle)) / angle**2 * cross @ cross
-    return matrix
+    return np.asarray(np.eye(3) + np.sin(angle) / angle * cross + (1 - np.cos(angle)) / angle**2 * cross @ cross)
 
 
 def vector_of(rotation: FloatArray) -> FloatArray:
@@ -213,13 +210,13 @@ def fit_alignment(pairs: BoxPairs, start: Alignment, *, time: bool = False, disp
         scale = max(float(1.4826 * np.median(np.abs(r))), 0.5) if len(r) else 1.0
         weight = 1 / (scale**2 * (1 + (r / (CAUCHY * scale)) ** 2))
         normal = j.T @ (weight[:, None] * j) + information
-        step = np.linalg.solve(normal, j.T @ (weight * r) - information @ state)
+        step = np.asarray(np.linalg.solve(normal, j.T @ (weight * r) - information @ state), dtype=np.float64)
         turned = vector_of(rotation_of(step[ROTATION]) @ rotation_of(state[ROTATION]))
         state = np.asarray(state + step, dtype=np.float64)
         state[ROTATION] = turned
         if np.abs(step[ROTATION]).max() < 1e-5 and np.abs(step[DISPLACEMENT]).max() < 1e-4:
             break
-    inverse = np.linalg.inv(normal)
+    inverse = np.asarray(np.linalg.inv(normal), dtype=np.float64)
     gradients = (weight * r)[:, None] * j
     groups, index = np.unique(np.broadcast_to(pairs.groups[:, None], used.shape)[used], return_inverse=True)
     sums = np.zeros((len(groups), STATE))

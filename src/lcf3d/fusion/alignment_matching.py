@@ -158,8 +158,8 @@ def _votes(camera: Camera, projected: FloatArray, labels: IntArray, sure: Detect
     sides = np.log(np.maximum(projected[:, 2:] - projected[:, :2], 1e-3))
     sides2d = np.log(np.maximum(found[:, 2:] - found[:, :2], 1e-3))
     limits = np.array([camera.width, camera.height])
-    whole: BoolArray = np.concatenate([found[:, :2] > BORDER_PX, found[:, 2:] < limits - BORDER_PX], axis=1).all(axis=1)
-    alike: BoolArray = (np.abs(sides[:, None] - sides2d[None]) < SIDES).all(axis=2)
+    whole: BoolArray = np.all([found[:, :2] > BORDER_PX, found[:, 2:] < limits - BORDER_PX], axis=(0, 2))
+    alike: BoolArray = np.all(np.abs(sides[:, None] - sides2d[None]) < SIDES, axis=2)
     i, j = np.nonzero(alike & (labels[:, None] == sure.labels[None]) & whole[None])
     votes: FloatArray = _angles(found, camera)[j] - _angles(projected, camera)[i]
     return votes
