@@ -22,14 +22,12 @@ import numpy as np
 
 from lcf3d import FusionConfig, LateCascadeFusion
 from lcf3d.datasets.kitti import KittiDataset
-from lcf3d.evaluation.calibration_study import average_precisions
-from lcf3d.evaluation.kitti import evaluate
+from lcf3d.datasets.kitti_results import image_boxes
+from lcf3d.evaluation.kitti import evaluate, result_folder
 from lcf3d.formats.kitti import KittiFrames, objects_from_detections, read_folder, write_objects
 from lcf3d.fusion.alignment import rotation_of
 from lcf3d.fusion.alignment_watch import AlignmentWatch, WatchSettings
 from lcf3d.fusion.self_calibration import self_calibrate
-from lcf3d.run.folder import image_boxes
-from lcf3d.run.results import CameraResults, LidarResults
 from lcf3d.structures import Camera, Detections2D, Detections3D, FloatArray, Frame
 
 ANGLES = (0.0, 0.2, 0.5, 1.0, 2.0, 5.0)
@@ -94,7 +92,7 @@ def scores(inputs: Inputs, found: list[tuple[Detections3D, FloatArray]], truth: 
             lines = objects_from_detections(boxes, projected, frame.cameras[0].camera_from_lidar)
             write_objects(Path(folder) / f"{frame.id}.txt", lines)
         metrics = evaluate(truth, read_folder(Path(folder), truth.frame_ids, results=True))
-    return {name: round(average_precisions(metrics, name)[1], 2) for name in ("Car", "Pedestrian")}
+    return {name: round(metrics.ap(name, "3d", "moderate"), 2) for name in ("Car", "Pedestrian")}
 
 
 def main() -> None:
@@ -111,20 +109,19 @@ def main() -> None:
 
     config = FusionConfig.preset("kitti").updated(recovery=False)
     dataset = KittiDataset(options.root, options.split, class_names=config.class_names)
-    lidar, camera = LidarResults(options.lidar, config.class_names), CameraResults(options.camera, config.class_names)
-    lidar.load(dataset.ids)
-    camera.load(dataset.ids)
+    lidar = dataset.lidar_results(options.lidar, config.class_names)
+    camera = dataset.camera_results(options.camera, config.class_names)
     frames = [dataset.frame(frame_id) for frame_id in dataset.ids]
     inputs = [
         (frame.with_cameras([frame.camera("left")]), lidar.detect(frame), camera.detect(frame, "left"))
         for frame in frames
     ]
     truth = read_folder(options.root / "training" / "label_2", dataset.ids, results=False)
-    alone = evaluate(truth, read_folder(lidar.folder, dataset.ids, results=True))
+    alone = evaluate(truth, read_folder(result_folder(options.lidar), dataset.ids, results=True))
     table: dict[str, Any] = {
         "frames": len(frames),
         "axis": options.axis,
-        "lidar_alone": {name: round(average_precisions(alone, name)[1], 2) for name in ("Car", "Pedestrian")},
+        "lidar_alone": {name: round(alone.ap(name, "3d", "moderate"), 2) for name in ("Car", "Pedestrian")},
         "angles": [],
     }
     print("LiDAR alone", table["lidar_alone"], flush=True)
