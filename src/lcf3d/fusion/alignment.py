@@ -13,6 +13,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numba import njit
 
 from lcf3d.geometry.boxes import box_corners
 from lcf3d.structures import BoolArray, Camera, FloatArray, IntArray
@@ -229,33 +230,67 @@ def fit_alignment(pairs: BoxPairs, start: Alignment, *, time: bool = False, disp
 
 def _edges(pairs: BoxPairs, state: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Normalised residuals (N, 4) of ``x1 y1 x2 y2`` and the derivative (N, 4, 9) of the predicted edges."""
+    residuals = np.full((len(pairs), 4), np.nan)
+    jacobian = np.zeros((len(pairs), 4, STATE))
+    focal = np.linalg.norm(np.cross(pairs.matrices[:, :2], pairs.matrices[:, 2:3]), axis=2)
+    spread = np.array([EDGE_PX, EDGE_SHARE, EDGE_M])
     turn = rotation_of(state[ROTATION])
-    turned = (pairs.corners + state[TIME] * pairs.velocities[:, None]) @ turn.T
-    moving = pairs.velocities @ turn.T
-    homogeneous = np.einsum("nij,nkj->nki", pairs.matrices, turned + state[DISPLACEMENT])
-    depth = np.where(homogeneous[..., 2] > 0.5, homogeneous[..., 2], np.nan)
-    pixels = homogeneous[..., :2] / depth[..., None]
-    rows = np.arange(len(pixels))
-    safe: BoolArray = np.asarray(np.isfinite(depth).all(axis=1))
-    shown = np.where(safe[:, None, None], pixels, 0)
-    corner = np.concatenate([shown.argmin(axis=1), shown.argmax(axis=1)], axis=1)  # (N, 4)
-    axis = np.array([0, 1, 0, 1])
-    edge = shown[rows[:, None], corner, axis]
-    size = np.concatenate([edge[:, 2:] - edge[:, :2]] * 2, axis=1)
-    inward = np.array([1, 1, -1, -1]) / 2 * size
-    predicted = edge + inward * state[SHRINKAGE][axis]
+    _fill_edges(
+        pairs.corners,
+        pairs.velocities,
+        np.array(pairs.matrices),
+        pairs.edges,
+        focal,
+        spread,
+        turn,
+        state,
+        residuals,
+        jacobian,
+    )
+    return residuals, jacobian
 
-    point = turned[rows[:, None], corner]
-    z = depth[rows[:, None], corner]
-    slope = (pairs.matrices[:, axis] - edge[..., None] * pairs.matrices[:, None, 2]) / z[..., None]  # (N, 4, 3)
-    jacobian = np.zeros((*edge.shape, STATE))
-    jacobian[..., ROTATION] = np.cross(point, slope)
-    jacobian[..., DISPLACEMENT] = slope
-    jacobian[..., SHRINKAGE] = inward[..., None] * np.eye(2)[axis]
-    jacobian[..., TIME] = np.einsum("nki,ni->nk", slope, moving)
 
-    focal = np.linalg.norm(np.cross(pairs.matrices[:, :2], pairs.matrices[:, 2:3]), axis=2)[:, axis]
-    sides = np.concatenate([pairs.edges[:, 2:] - pairs.edges[:, :2]] * 2, axis=1)
-    sigma = np.sqrt(EDGE_PX**2 + (EDGE_SHARE * sides) ** 2 + (EDGE_M * focal / z) ** 2)
-    residuals = np.where(safe[:, None], (pairs.edges - predicted) / sigma, np.nan)
-    return residuals, jacobian / sigma[..., None]
+@njit(cache=True, nogil=True)
+def _fill_edges(  # type: ignore[no-untyped-def]
+    corners, velocities, matrices, edges, focal, spread, turn, state, residuals, jacobian
+):
+    """Fill ``residuals`` and ``jacobian``; a box that comes nearer than half a metre keeps NaN."""
+    turned, homogeneous, moving = np.empty((8, 3)), np.empty((8, 3)), np.empty(3)
+    shown, slope = np.empty((2, 8)), np.empty(3)
+    for n in range(len(corners)):
+        safe = True
+        _multiply(turn, velocities[n], moving)
+        for c in range(8):
+            _multiply(turn, corners[n, c], turned[c])
+            for i in range(3):
+                turned[c, i] += state[8] * moving[i]
+                slope[i] = turned[c, i] + state[3 + i]
+            _multiply(matrices[n], slope, homogeneous[c])
+            safe &= homogeneous[c, 2] > 0.5
+            shown[0, c], shown[1, c] = homogeneous[c, 0] / homogeneous[c, 2], homogeneous[c, 1] / homogeneous[c, 2]
+        if not safe:
+            continue
+        for e in range(4):
+            a, sign = e % 2, 1.0 if e < 2 else -1.0
+            inward = (shown[a].max() - shown[a].min()) / 2 * sign
+            c = (sign * shown[a]).argmin()
+            z, edge = homogeneous[c, 2], shown[a, c]
+            side = edges[n, a + 2] - edges[n, a]
+            sigma = np.sqrt(spread[0] ** 2 + (spread[1] * side) ** 2 + (spread[2] * focal[n, a] / z) ** 2)
+            residuals[n, e] = (edges[n, e] - edge - inward * state[6 + a]) / sigma
+            for i in range(3):
+                slope[i] = (matrices[n, a, i] - edge * matrices[n, 2, i]) / (z * sigma)
+                jacobian[n, e, 3 + i] = slope[i]
+                jacobian[n, e, 8] += slope[i] * moving[i]
+            x, y, w = turned[c, 0], turned[c, 1], turned[c, 2]
+            jacobian[n, e, 0] = y * slope[2] - w * slope[1]
+            jacobian[n, e, 1] = w * slope[0] - x * slope[2]
+            jacobian[n, e, 2] = x * slope[1] - y * slope[0]
+            jacobian[n, e, 6 + a] = inward / sigma
+
+
+@njit(cache=True, nogil=True)
+def _multiply(matrix, vector, result):  # type: ignore[no-untyped-def]
+    """``result`` (3,) = (3, 3) ``matrix`` times (3,) ``vector``."""
+    for i in range(3):
+        result[i] = matrix[i, 0] * vector[0] + matrix[i, 1] * vector[1] + matrix[i, 2] * vector[2]
