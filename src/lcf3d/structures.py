@@ -77,6 +77,7 @@ class Camera:
         height: image height in pixels.
         distortion: of the lens; None (and what a lens of zeros becomes) for a pinhole camera. ``projection`` is then
             the camera's without it, and pixels, those of 2D detections too, are the ones of the image as it was taken.
+        delay: seconds from the scan to the image; boxes are moved on by their velocities for as long.
     """
 
     name: str
@@ -85,6 +86,7 @@ class Camera:
     width: int
     height: int
     distortion: Distortion | None = None
+    delay: float = 0.0
     pixels_from_lidar: FloatArray = field(init=False, repr=False)
 
     def __post_init__(self) -> None:

@@ -164,6 +164,11 @@ class AlignmentWatch:
                 renewed = latest
         self._estimates[name] = renewed
 
+    def forget(self, camera: str) -> None:
+        """Begin anew with a camera, as after a new calibration."""
+        for kept in (self._sightings, self._estimates, self._seen):
+            kept.pop(camera, None)  # type: ignore[attr-defined]
+
     def estimate(self, camera: str) -> Alignment:
         """The estimate so far."""
         return self._estimates.get(camera, Alignment.nominal())
