@@ -23,6 +23,9 @@ from lcf3d.live.workers import Worker, attempt
 from lcf3d.provenance import FusedDetections
 from lcf3d.structures import Camera, Detections3D, FloatArray, Frame
 
+# what a detector believes to move more slowly than this is taken to stand (m/s)
+STANDING = 1.5
+
 
 @dataclass(frozen=True)
 class LiveSettings:
@@ -322,7 +325,9 @@ class Fuser:
         centres = lidar.boxes[:, :3]
         relative = (centres @ motion[:3, :3].T + motion[:3, 3] - centres) / step
         if lidar.velocities is not None:
-            relative[:, :2] += np.nan_to_num(lidar.velocities)
+            moving = np.nan_to_num(lidar.velocities)
+            # noise in the velocities of things that stand would make every offset look smaller
+            relative[:, :2] += np.where(np.hypot(moving[:, :1], moving[:, 1:]) > STANDING, moving, 0)
         return np.asarray(relative)
 
     def _notes(self, group: Group, blinded: Iterable[str]) -> list[str]:
