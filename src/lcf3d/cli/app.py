@@ -15,6 +15,7 @@ VERBS: dict[str, str] = {
     "demo": "demo",
     "simulate": "simulate",
     "run": "run",
+    "live": "live",
     "view": "view",
     "eval": "eval",
     "config": "config",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -22,8 +22,8 @@ COARSE_IOU, FINE_IOU = 0.3, 0.5
 BETTER = 1.1
 # frames that follow each other show the same objects: so many count as one
 CORRELATED = 5
-# with fewer pairs than this nothing is said
-FEWEST_PAIRS = 12
+# with fewer pairs than this nothing is said; the same of time, which a rotation is easily taken for
+FEWEST_PAIRS, FEWEST_TIMED = 12, 60
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,8 @@ class WatchSettings:
         wrong_deg: a rotation surely above this is called wrong.
         sure: how many standard deviations "surely" is.
         time: also estimate the time offset.
-        late_s: a time offset surely above this is called drifting, above four times this wrong.
+        late_s: a time offset surely above this is called drifting, above four times this wrong; judged only where it
+            is known to half of this.
     """
 
     window: int = 50
@@ -122,7 +123,7 @@ class AlignmentWatch:
         frame: Frame,
         lidar: Detections3D,
         camera: Mapping[str, Detections2D],
-        velocities: FloatArray | None = None,
+        velocities: Callable[[float], FloatArray | None] | None = None,
     ) -> None:
         """Take one frame in; every `WatchSettings.every` frames of a camera its estimate is renewed.
 
@@ -130,15 +131,17 @@ class AlignmentWatch:
             frame: with the cameras as their calibration says, not corrected.
             lidar: 3D detections; scores of any scale.
             camera: 2D detections by camera.
-            velocities: (N, 3) m/s of the boxes relative to the car, in the LiDAR frame, for the time offset.
+            velocities: for the time offset: gives (N, 3) m/s of the boxes as seen from the car, in the LiDAR frame, on
+                average over so many seconds after the scan; or None where they are not known.
         """
         boxes = lidar.with_classes(self.class_names)
-        if velocities is not None:
-            names = set(self.class_names)
-            velocities = velocities[[lidar.class_names[label] in names for label in lidar.labels]]
+        wanted = np.isin(np.array(lidar.class_names), self.class_names)[lidar.labels] if len(lidar) else slice(None)
         for view in frame.cameras:
             if view.name in camera:
-                self._observe_camera(view, boxes, camera[view.name].with_classes(self.class_names), velocities)
+                ahead = self.estimate(view.name).time_offset
+                speeds = None if velocities is None else velocities(ahead)
+                speeds = None if speeds is None else speeds[wanted]
+                self._observe_camera(view, boxes, camera[view.name].with_classes(self.class_names), speeds)
 
     def _observe_camera(
         self, view: Camera, boxes: Detections3D, found: Detections2D, velocities: FloatArray | None
@@ -221,7 +224,9 @@ def judge(alignment: Alignment, settings: WatchSettings) -> Status:
     if alignment.pairs < FEWEST_PAIRS:
         return "unknown"
     surely = np.rad2deg(alignment.surely_beyond(settings.sure))
-    late = abs(alignment.time_offset) - settings.sure * float(alignment.deviation[TIME]) if settings.time else 0.0
+    late, late_deviation = 0.0, float(alignment.deviation[TIME])
+    if settings.time and alignment.pairs >= FEWEST_TIMED and late_deviation < settings.late_s / 2:
+        late = abs(alignment.time_offset) - settings.sure * late_deviation
     if surely > settings.wrong_deg or late > 4 * settings.late_s:
         return "wrong"
     if surely > settings.drifting_deg or late > settings.late_s:

@@ -143,6 +143,11 @@ class Fuser:
         with self._lock:
             warm_up(self.fusion, [self._model(name, np.inf) for name in self._models], self._detectors)
 
+    def dropped(self) -> dict[str, int]:
+        """Messages left out, by ``source: cause``."""
+        with self._lock:
+            return {f"{source}: {cause}": count for (source, cause), count in sorted(self._sync.dropped.items())}
+
     def diagnostics(self) -> list[dict[str, Any]]:
         """Health of every part as plain values in the form of ROS ``diagnostic_msgs/DiagnosticStatus``."""
         with self._lock:
@@ -188,13 +193,20 @@ class Fuser:
             self._sync.add_camera(message.camera, CameraPart(message.time, message.detections, None, arrival))
 
     def _learn_camera(self, message: CameraModel) -> None:
-        """A calibration that is new, or that changes in the middle: the watch then begins anew for this camera."""
+        """A calibration that is new, or that changes in the middle.
+
+        Where it differs by more than the motion of a car between scan and image, the watch begins anew.
+        """
         known = self._models.setdefault(message.camera.name, [])
-        if known:
+        anew = bool(known) and not _nearly(known[-1][1], message.camera)
+        if anew:
             self.health.tell(f"camera {message.camera.name}: new calibration at {message.time:.3f} s")
         known.append((message.time if known else -np.inf, message.camera))
         known.sort(key=lambda entry: entry[0])
-        if self.watch is not None:
+        # those that no group to come can ask for
+        while len(known) > 1 and known[1][0] <= self._sync.closed:
+            known.pop(0)
+        if anew and self.watch is not None:
             self.watch.forget(message.camera.name)
 
     def _model(self, name: str, time: float) -> Camera:
@@ -283,8 +295,8 @@ class Fuser:
         found = {name: part.detections for name, part in group.cameras.items() if name in self._models}
         self.health.fused(frame, result, found, latency, group.points)
         if self.watch is not None:
-            velocities = self._relative_velocities(group.time, group.lidar)
-            self.watch.observe(nominal, group.lidar, found, velocities)
+            lidar = group.lidar
+            self.watch.observe(nominal, lidar, found, lambda ahead: self._relative_velocities(group.time, lidar, ahead))
 
     def _frame(self, group: Group) -> tuple[Frame, Frame]:
         """What is fused, with each camera as it stood at its own moment; and the same without corrections."""
@@ -314,12 +326,15 @@ class Fuser:
         transform = camera.camera_from_lidar if motion is None else camera.camera_from_lidar @ motion
         return replace(camera, camera_from_lidar=transform, delay=shift)
 
-    def _relative_velocities(self, time: float, lidar: Detections3D) -> FloatArray | None:
-        """(N, 3) m/s of boxes as seen from the moving LiDAR, in its axes; None without poses or the wish for it."""
+    def _relative_velocities(self, time: float, lidar: Detections3D, ahead: float) -> FloatArray | None:
+        """(N, 3) m/s of boxes as seen from the moving LiDAR, in its axes, on average over some seconds after a scan.
+
+        None without poses or the wish for it. Less than 50 ms are taken as the 50 ms before the scan.
+        """
         if self.watch is None or not self.watch.settings.time:
             return None
-        step = 0.05
-        motion = self._poses.motion(time - step, time)
+        step = ahead if abs(ahead) > 0.05 else -0.05
+        motion = self._poses.motion(time, time + step)
         if motion is None:
             return None
         centres = lidar.boxes[:, :3]
@@ -344,3 +359,13 @@ class Fuser:
     def _detector_times(self, group: Group) -> dict[str, float]:
         times = {"scan": group.time, **{f"camera {n}": p.time for n, p in group.cameras.items()}}
         return {f"detect {s}": self._detect_ms[s, t] for s, t in times.items() if (s, t) in self._detect_ms}
+
+
+def _nearly(camera: Camera, other: Camera) -> bool:
+    """Whether two calibrations are of one camera on a moving car: equal but for a turn by a degree or so."""
+    turn = camera.camera_from_lidar[:3, :3].T @ other.camera_from_lidar[:3, :3]
+    same = np.allclose(camera.projection, other.projection) and (camera.width, camera.height) == (
+        other.width,
+        other.height,
+    )
+    return bool(same and np.trace(turn) > 1 + 2 * np.cos(np.deg2rad(3.0)))
