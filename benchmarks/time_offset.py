@@ -171,7 +171,7 @@ def measure(log: Log, offset: float, velocities: float | None, window: int) -> d
     rows = {}
     for name, values in errors.items():
         array, deviation = np.array(values), np.array(sure[name])
-        told = deviation < 10
+        told = np.asarray(deviation < 10, dtype=bool)
         rows[name] = {
             "moments": len(array),
             "told_to_10_ms": int(told.sum()),

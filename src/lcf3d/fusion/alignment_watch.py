@@ -150,7 +150,8 @@ class AlignmentWatch:
         count = self._seen.get(view.name, 0)
         self._seen[view.name] = count + 1
         kept.append(Matcher(Sighting.of(view, boxes, found, velocities, count // CORRELATED)))
-        if (count + 1) % self.settings.every == 0:
+        # the cameras take turns, so that no frame has to wait for all of them
+        if (count + 1 + list(self._sightings).index(view.name)) % self.settings.every == 0:
             self._renew(view.name, kept)
 
     def _renew(self, name: str, kept: deque[Matcher]) -> None:

@@ -36,6 +36,7 @@ class LiveSettings:
         realtime: run detectors in threads, newest first. Without it they run when a message is pushed and nothing is
             left out for want of time: the same messages give the same results.
         watch: settings of the calibration watch, None for no watch.
+        watch_period: seconds from one frame that the watch looks at to the next: those in between show the same.
         correct: turn each camera as the watch says, and move it in time.
         leave_out_blinded: do not use a camera that confirms far fewer LiDAR boxes than it used to.
     """
@@ -43,6 +44,7 @@ class LiveSettings:
     sync: SyncSettings = field(default_factory=SyncSettings)
     realtime: bool = False
     watch: WatchSettings | None = field(default_factory=WatchSettings)
+    watch_period: float = 0.1
     correct: bool = False
     leave_out_blinded: bool = True
 
@@ -115,6 +117,7 @@ class Fuser:
         self._workers: dict[str, Worker] = {}
         self._detect_ms: dict[tuple[str, float], float] = {}
         self._results: list[LiveResult] = []
+        self._watched = -np.inf
         self._lock = threading.RLock()
 
     def push(self, message: Message) -> list[LiveResult]:
@@ -294,7 +297,8 @@ class Fuser:
         assert group.lidar is not None
         found = {name: part.detections for name, part in group.cameras.items() if name in self._models}
         self.health.fused(frame, result, found, latency, group.points)
-        if self.watch is not None:
+        if self.watch is not None and not 0 <= group.time - self._watched < 0.9 * self.settings.watch_period:
+            self._watched = group.time
             lidar = group.lidar
             self.watch.observe(nominal, lidar, found, lambda ahead: self._relative_velocities(group.time, lidar, ahead))
 
