@@ -4,6 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from lcf3d.distortion import Distortion
 from lcf3d.errors import ConfigError
 from lcf3d.fusion.alignment import (
     DISPLACEMENT,
@@ -18,7 +19,7 @@ from lcf3d.fusion.alignment import (
 from lcf3d.fusion.alignment_matching import Sighting, vote_rotation
 from lcf3d.fusion.alignment_watch import AlignmentWatch, WatchSettings, estimate
 from lcf3d.geometry.camera import project_boxes, project_points
-from lcf3d.structures import Detections2D, Frame
+from lcf3d.structures import Camera, Detections2D, Frame
 from tests.fusion.scenes import CAR, PEDESTRIAN, camera, car, lidar, pedestrian
 
 NAMES = ("Car", "Pedestrian", "Cyclist")
@@ -246,3 +247,22 @@ def test_boxes_that_are_not_finite_take_no_part():
         len(Sighting.of(frame.cameras[0], bad, found).boxes)
         == len(Sighting.of(frame.cameras[0], boxes, found).boxes) - 1
     )
+
+
+def test_a_camera_with_a_wide_lens_is_found_too():
+    fisheye = Camera(
+        "left",
+        camera(focal=300.0).projection,
+        camera().camera_from_lidar,
+        1000,
+        400,
+        distortion=Distortion("fisheye", (0.02, -0.004, 0.0, 0.0)),
+    )
+    degrees, rng, sightings = [0.5, -1.5, 0.3], np.random.default_rng(4), []
+    for _ in range(20):
+        boxes, labels = street(rng)
+        projected, visible = project_boxes(boxes, realigned(fisheye, np.deg2rad(degrees)))
+        found = Detections2D(projected[visible], np.full(visible.sum(), 0.9), labels[visible], NAMES)
+        sightings.append(Sighting.of(fisheye, lidar(boxes, np.full(len(boxes), 0.8), labels), found))
+    found = estimate(sightings, Alignment.nominal())
+    assert np.abs(np.rad2deg(found.rotation) - degrees).max() < 0.05

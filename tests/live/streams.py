@@ -44,7 +44,7 @@ def fuser(
     views=None, realtime=False, on_result=None, detectors=None, lidar_detector=None, correct=False, watch=None, **sync
 ):
     values = {"tolerance": 0.04, "deadline": 0.25, "scans": False, **sync}
-    settings = LiveSettings(SyncSettings(**values), realtime, watch, correct)
+    settings = LiveSettings(SyncSettings(**values), realtime=realtime, watch=watch, correct=correct)
     return Fuser(
         fusion(),
         [camera()] if views is None else views,

@@ -87,7 +87,7 @@ def _print(report: ReplayReport) -> None:
 
     console = Console()
     console.print(
-        f"{report.frames} frames in {report.seconds:.1f} s, {report.results} results, {report.behind} frames behind time"
+        f"{report.frames} frames in {report.seconds:.1f} s: {report.results} results, {report.behind} behind time"
     )
     table = Table("stage", "median ms", "99th percentile")
     for part, values in report.latency_ms.items():

@@ -16,6 +16,8 @@ import numpy as np
 from numba import njit
 
 from lcf3d.geometry.boxes import box_corners
+from lcf3d.geometry.camera import cut_by_field
+from lcf3d.geometry.lens import local_projection
 from lcf3d.structures import BoolArray, Camera, FloatArray, IntArray
 
 STATE = 9
@@ -78,10 +80,11 @@ class BoxPairs:
         free = np.concatenate([boxes2d[:, :2] > BORDER_PX, boxes2d[:, 2:] < limits - BORDER_PX], axis=1)
         near = corners[..., 2].min(axis=1) < NEAREST if len(boxes) else np.zeros(0, dtype=bool)
         free &= ~near[:, None]
+        free &= ~cut_by_field(boxes2d, camera)[:, None]
         return cls(
             corners,
             moving @ rotation.T,
-            np.broadcast_to(camera.intrinsics, (len(boxes), 3, 3)),
+            _matrices(boxes2d, camera),
             np.asarray(boxes2d, dtype=np.float64),
             free,
             np.full(len(boxes), group, dtype=np.int64),
@@ -147,6 +150,14 @@ class Alignment:
 def centre_offset(camera: Camera) -> FloatArray:
     """(3,) what to add to camera coordinates to count them from the camera's centre (``projection = K [I | t]``)."""
     return np.asarray(np.linalg.solve(camera.intrinsics, camera.projection[:, 3]), dtype=np.float64)
+
+
+def _matrices(boxes2d: FloatArray, camera: Camera) -> FloatArray:
+    """(N, 3, 3) pixels from points counted from the camera's centre, around each (N, 4) pixel box of a lens."""
+    if camera.distortion is None:
+        return np.broadcast_to(camera.intrinsics, (len(boxes2d), 3, 3))
+    turn = camera.camera_from_lidar[:3, :3].T
+    return np.array([local_projection(camera, box)[:, :3] @ turn for box in boxes2d]).reshape(-1, 3, 3)
 
 
 def rotation_of(vector: FloatArray) -> FloatArray:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from lcf3d.fusion.alignment import BORDER_PX, BoxPairs, realigned
 from lcf3d.fusion.clustering import cluster_boxes
 from lcf3d.fusion.matching import assign
-from lcf3d.geometry.camera import project_boxes
+from lcf3d.geometry.camera import pixel_rays, project_boxes
 from lcf3d.geometry.iou import image_iou
 from lcf3d.structures import BoolArray, Camera, Detections2D, Detections3D, FloatArray, IntArray
 
@@ -84,7 +84,8 @@ def _surest(camera: Camera, lidar: Detections3D, count: int) -> tuple[IntArray, 
 
     In view means within `REACH` of the image's borders.
     """
-    margin = float(np.tan(REACH) * np.abs(camera.intrinsics[0]).max())
+    # a lens may not be known beyond its image
+    margin = float(np.tan(REACH) * np.abs(camera.intrinsics[0]).max()) if camera.distortion is None else 0.0
     projected, visible = project_boxes(lidar.boxes, _wider(camera, margin))
     seen = np.flatnonzero(visible & np.isfinite(lidar.boxes).all(axis=1) & np.isfinite(lidar.scores))
     some = lidar[seen]
@@ -167,8 +168,7 @@ def _votes(camera: Camera, projected: FloatArray, labels: IntArray, sure: Detect
 
 def _angles(boxes: FloatArray, camera: Camera) -> FloatArray:
     """(N, 2) pitch and yaw of the rays through the centres of (N, 4) pixel boxes, camera axes."""
-    centres = np.concatenate([(boxes[:, :2] + boxes[:, 2:]) / 2, np.ones((len(boxes), 1))], axis=1)
-    rays = np.linalg.solve(camera.intrinsics, centres.T).T
+    rays = pixel_rays((boxes[:, :2] + boxes[:, 2:]) / 2, camera) @ camera.camera_from_lidar[:3, :3].T
     yaw = np.arctan2(rays[:, 0], rays[:, 2])
     pitch = np.arctan2(-rays[:, 1], np.hypot(rays[:, 0], rays[:, 2]))
     return np.stack([pitch, yaw], axis=1)
@@ -177,10 +177,5 @@ def _angles(boxes: FloatArray, camera: Camera) -> FloatArray:
 def _wider(camera: Camera, margin: float) -> Camera:
     """The camera with an image that is larger by ``margin`` pixels on every side."""
     shift = np.array([[1, 0, margin], [0, 1, margin], [0, 0, 1]])
-    return Camera(
-        camera.name,
-        shift @ camera.projection,
-        camera.camera_from_lidar,
-        int(camera.width + 2 * margin),
-        int(camera.height + 2 * margin),
-    )
+    size = int(camera.width + 2 * margin), int(camera.height + 2 * margin)
+    return replace(camera, projection=shift @ camera.projection, width=size[0], height=size[1])
