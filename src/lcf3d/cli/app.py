@@ -16,6 +16,7 @@ VERBS: dict[str, str] = {
     "simulate": "simulate",
     "run": "run",
     "live": "live",
+    "ros2": "ros2",
     "view": "view",
     "eval": "eval",
     "config": "config",
