@@ -12,6 +12,7 @@ Conventions (all of the package, converted only at its edges, see ``lcf3d.geomet
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -76,6 +77,7 @@ class Camera:
         height: image height in pixels.
         distortion: of the lens; None (and what a lens of zeros becomes) for a pinhole camera. ``projection`` is then
             the camera's without it, and pixels, those of 2D detections too, are the ones of the image as it was taken.
+        delay: seconds from the scan to the image; boxes are moved on by their velocities for as long.
     """
 
     name: str
@@ -84,6 +86,7 @@ class Camera:
     width: int
     height: int
     distortion: Distortion | None = None
+    delay: float = 0.0
     pixels_from_lidar: FloatArray = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -393,6 +396,12 @@ class Frame:
             if camera.name == name:
                 return camera
         raise ConfigError(f"frame {self.id} has no camera {name!r}; it has {[c.name for c in self.cameras]}")
+
+    def with_cameras(self, cameras: Sequence[Camera]) -> Frame:
+        """The same frame with other cameras; scan, images and labels are those of this one, read when asked for."""
+        frame = copy(self)
+        frame.cameras = tuple(cameras)
+        return frame
 
     def __repr__(self) -> str:
         return f"Frame({self.id!r}, cameras={[c.name for c in self.cameras]})"

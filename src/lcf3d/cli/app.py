@@ -15,6 +15,8 @@ VERBS: dict[str, str] = {
     "demo": "demo",
     "simulate": "simulate",
     "run": "run",
+    "live": "live",
+    "ros2": "ros2",
     "view": "view",
     "eval": "eval",
     "config": "config",

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from lcf3d.errors import ConfigError
+
 if TYPE_CHECKING:
     from lcf3d.datasets.check import Finding
 
@@ -17,13 +19,22 @@ def check(
     split: Annotated[str | None, typer.Option(help="split of the dataset; all frames if left out")] = None,
     results: Annotated[Path | None, typer.Option(help="also check these result files")] = None,
     tables: Annotated[str | None, typer.Option(help="nuScenes: folder of tables; the only one if left out")] = None,
+    lidar: Annotated[str | None, typer.Option(help="LiDAR detector, kind:argument: with it and --camera ...")] = None,
+    camera: Annotated[
+        str | None,
+        typer.Option(help="... camera detector, kind:argument: how does each camera stand against the LiDAR?"),
+    ] = None,
     json_: Annotated[bool, typer.Option("--json", help="print the findings as JSON")] = False,
 ) -> None:
     """Look a dataset over before it costs an evening: files, shapes, calibration against labels and scans.
 
     Exit code 0 without errors (warnings are allowed), 1 with errors.
 
-    Example: lcf3d check kitti:KITTI --split val --results runs/point_gnn/data
+    Examples:
+
+    lcf3d check kitti:KITTI --split val --results runs/point_gnn/data
+
+    lcf3d check kitti:KITTI --lidar results:point_gnn --camera results:rcnn_2d
     """
     import json
     from dataclasses import asdict
@@ -39,12 +50,32 @@ def check(
             return lambda: progress.advance(task)
 
         findings = check_dataset(dataset, results, begin, split=split, version=tables)
+    if (lidar is None) != (camera is None):
+        raise ConfigError("how cameras stand against the LiDAR takes both, --lidar and --camera")
+    if lidar is not None and camera is not None:
+        findings += _alignment(dataset, split, tables, lidar, camera, quiet=json_)
     if json_:
         typer.echo(json.dumps([asdict(finding) for finding in findings], indent=2))
     else:
         _print(findings)
     if any(finding.severity == "error" for finding in findings):
         raise typer.Exit(1)
+
+
+def _alignment(
+    dataset: str, split: str | None, tables: str | None, lidar: str, camera: str, quiet: bool
+) -> list[Finding]:
+    """How each camera stands, printed, and what is wrong with it."""
+    from lcf3d.run.alignment import alignment_findings, describe, find_alignment
+    from lcf3d.run.setup import RunRequest, read_inputs
+
+    request = RunRequest(dataset, lidar, {"*": camera}, split=split, tables=tables, recovery="off")
+    inputs = read_inputs(request)
+    reports = find_alignment(inputs.dataset, inputs.frame_ids, inputs.lidar, inputs.cameras, inputs.config.class_names)
+    if not quiet:
+        for name, (whole, *_) in reports.items():
+            typer.echo(f"camera {name}: {whole.status}; {describe(whole)}")
+    return alignment_findings(reports)
 
 
 def _print(findings: list[Finding]) -> None:

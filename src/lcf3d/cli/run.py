@@ -44,6 +44,9 @@ def run(
         str, typer.Option(help="score calibration: a file of 'lcf3d calibrate', auto, or none")
     ] = "auto",
     missing: Annotated[str, typer.Option(help="result files that are not there: error, or empty")] = "error",
+    self_calibrate: Annotated[
+        bool, typer.Option("--self-calibrate", help="turn cameras as the matches of the whole drive say")
+    ] = False,
     jobs: Annotated[int, typer.Option(min=1, help="processes")] = 1,
     pictures: Annotated[bool, typer.Option("--pictures", help="also draw every frame")] = False,
     resume: Annotated[bool, typer.Option("--resume", help="continue a run that was interrupted")] = False,
@@ -79,6 +82,7 @@ def run(
         tiles=tiles,
         calibration=calibration,
         missing=missing,
+        self_calibrate=self_calibrate,
     )
     prepared = prepare_run(request, out, resume=resume, overwrite=overwrite)
     pending = [frame_id for frame_id in prepared.frame_ids if not prepared.folder.is_done(frame_id)]

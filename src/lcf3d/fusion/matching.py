@@ -11,7 +11,7 @@ from numba import njit
 from lcf3d.fusion.clustering import Clusters
 from lcf3d.geometry.camera import project_boxes
 from lcf3d.geometry.iou import image_iou
-from lcf3d.structures import BoolArray, Camera, FloatArray, IntArray
+from lcf3d.structures import BoolArray, Camera, Detections3D, FloatArray, IntArray
 
 Assignment = Literal["gated", "paper"]
 
@@ -148,6 +148,15 @@ def match_view(
         added = assign(np.where(free, iou, 0.0), iou_threshold, method)
         match[added >= 0] = added[added >= 0]
     return View(projected, seen, iou, match)
+
+
+def boxes_after(detections: Detections3D, seconds: float) -> FloatArray:
+    """(N, 7) boxes as they are some seconds later; those of unknown velocity have stayed."""
+    if not seconds or detections.velocities is None:
+        return detections.boxes
+    boxes = detections.boxes.copy()
+    boxes[:, :2] += seconds * np.nan_to_num(detections.velocities)
+    return boxes
 
 
 def merge_views(views: Sequence[View], cluster_count: int) -> Matches:

@@ -22,7 +22,7 @@ from lcf3d.fusion.decisions import (
     replace_unconfirmed,
 )
 from lcf3d.fusion.localizer import Localizer
-from lcf3d.fusion.matching import Matches, View, confirmed_elsewhere, match_view, merge_views
+from lcf3d.fusion.matching import Matches, View, boxes_after, confirmed_elsewhere, match_view, merge_views
 from lcf3d.fusion.recovery import Recovery, recover
 from lcf3d.fusion.roles import unknown_classes
 from lcf3d.fusion.warm_up import warm_up_frame
@@ -135,7 +135,7 @@ class LateCascadeFusion:
         )
         views = [
             match_view(
-                lidar.boxes,
+                boxes_after(lidar, camera.delay),
                 clusters,
                 camera,
                 found.boxes,

@@ -46,6 +46,11 @@ class RunFolder:
         """The score calibration used."""
         return self.path / "calibration.json"
 
+    @property
+    def alignment_path(self) -> Path:
+        """How the cameras stood against the LiDAR, of a run with ``--self-calibrate``."""
+        return self.path / "alignment.json"
+
     def provenance_path(self, frame_id: str) -> Path:
         """The provenance file of a frame."""
         return self.path / "provenance" / f"{frame_id}.json"
@@ -93,7 +98,7 @@ class RunFolder:
             if not inputs.is_file():
                 raise ConfigError(f"{self.path} holds files of something else; choose another --out")
             results = () if self._writer is None else self._writer.written()
-            for file in (*results, *self.path.glob("provenance/*.json"), self.calibration_path):
+            for file in (*results, *self.path.glob("provenance/*.json"), self.calibration_path, self.alignment_path):
                 file.unlink(missing_ok=True)
         write_json(inputs, run)
         config.dump(settings)

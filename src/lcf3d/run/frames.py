@@ -12,7 +12,9 @@ from typing import Any, Protocol
 
 from lcf3d.datasets.base import CameraSource, Dataset, LidarSource
 from lcf3d.errors import DatasetError
+from lcf3d.fusion.alignment import Alignment
 from lcf3d.provenance import FusedDetections, Outcome, Reason
+from lcf3d.run.alignment import aligned_frame
 from lcf3d.run.folder import RunFolder
 from lcf3d.run.sources import DetectorOnFrames, LidarOnScans
 from lcf3d.structures import Detections2D, Detections3D, Frame
@@ -55,6 +57,7 @@ class FrameRunner:
         cameras: the camera branch of each camera that is used, by camera name.
         fusion: the fusion.
         folder: where results go.
+        alignment: how cameras stand beside what their calibration says, by name.
     """
 
     dataset: Dataset
@@ -62,6 +65,7 @@ class FrameRunner:
     cameras: dict[str, CameraSource]
     fusion: Fusion
     folder: RunFolder
+    alignment: Mapping[str, Alignment] = field(default_factory=dict)
 
     def __call__(self, frame_id: str) -> FrameSummary:
         """Fuse one frame and write its files."""
@@ -71,7 +75,7 @@ class FrameRunner:
         marks.append(perf_counter())
         camera = self.detect_cameras(frame)
         marks.append(perf_counter())
-        fused = self._with_missing(self.fusion(frame, lidar, camera), frame)
+        fused = self._with_missing(self.fusion(aligned_frame(frame, self.alignment), lidar, camera), frame)
         marks.append(perf_counter())
         self.folder.write(frame, fused)
         marks.append(perf_counter())

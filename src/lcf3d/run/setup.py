@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -11,6 +11,8 @@ from typing import Any, NamedTuple
 from lcf3d.datasets.base import CameraSource, Dataset, LidarSource, by_camera, require_frames, require_missing
 from lcf3d.datasets.opening import open_dataset
 from lcf3d.errors import ConfigError, DatasetError
+from lcf3d.files import write_json
+from lcf3d.fusion.alignment import Alignment
 from lcf3d.fusion.calibration import Calibration, load_calibration
 from lcf3d.fusion.config import FusionConfig
 from lcf3d.fusion.localizer import Localizer
@@ -18,6 +20,7 @@ from lcf3d.fusion.pipeline import LateCascadeFusion
 from lcf3d.fusion.self_calibration import self_calibrate
 from lcf3d.fusion.stereo import StereoConfig, StereoLateCascadeFusion
 from lcf3d.localizers.named import load_localizer
+from lcf3d.run.alignment import aligned_frame, describe, find_alignment
 from lcf3d.run.folder import RunFolder
 from lcf3d.run.frames import FrameRunner
 from lcf3d.run.settings import build_config
@@ -50,6 +53,7 @@ class RunRequest:
         localizer: ``kind:ARGUMENT``, for recovery.
         tiles: overlapping tiles across wide images, for camera detectors that know them.
         calibration: file of ``lcf3d calibrate``, ``auto`` or ``none``.
+        self_calibrate: turn each camera as the matches of the whole drive say, see `lcf3d.run.alignment`.
         missing: result files that are not there: ``error`` or ``empty``.
     """
 
@@ -66,6 +70,7 @@ class RunRequest:
     tiles: int = 1
     calibration: str = "auto"
     missing: str = "error"
+    self_calibrate: bool = False
 
 
 class Inputs(NamedTuple):
@@ -116,16 +121,24 @@ def prepare_run(
     from lcf3d import __version__
 
     # checked before anything is written; with results in files this is quick
+    reports = find_alignment(dataset, frame_ids, lidar, cameras, config.class_names) if request.self_calibrate else {}
+    runner.alignment = {name: whole.alignment for name, (whole, *_) in reports.items()}
     if resume and folder.calibration_path.is_file():
         calibration: Calibration | None = Calibration.load(folder.calibration_path)
     else:
-        calibration = find_calibration(request.calibration, dataset, frame_ids, lidar, cameras, config)
+        calibration = find_calibration(
+            request.calibration, dataset, frame_ids, lidar, cameras, config, runner.alignment
+        )
     for source, maps in ((lidar, "lidar"), *((camera, "camera") for camera in cameras.values())):
         require = getattr(source, "require_probabilities", None)
         if require is not None:
             require(getattr(calibration, maps) if calibration else ())
     written: dict[str, Any] = {"lcf3d": __version__, **asdict(request)}
     folder.begin(config, _as_json(written), resume=resume, overwrite=overwrite)
+    if reports:
+        write_json(folder.alignment_path, {name: whole.to_json() for name, (whole, *_) in reports.items()})
+        for name, (whole, *_) in reports.items():
+            log.warning("camera %s: %s (%s)", name, describe(whole), whole.status)
     if calibration is not None:
         calibration.dump(folder.calibration_path)
         runner.fusion = make_fusion(config, localizer, calibration)
@@ -233,6 +246,7 @@ def find_calibration(
     lidar: LidarSource,
     cameras: dict[str, CameraSource],
     config: FusionConfig,
+    alignment: Mapping[str, Alignment] | None = None,
 ) -> Calibration | None:
     """The calibration of the file asked for, or one taught by the camera, where that is needed or costs nothing.
 
@@ -243,6 +257,7 @@ def find_calibration(
         lidar: the LiDAR branch.
         cameras: the camera branch by camera name.
         config: settings.
+        alignment: how cameras stand beside what their calibration says, by name.
 
     Raises:
         ConfigError: there is no such file.
@@ -270,7 +285,8 @@ def find_calibration(
     for frame in map(dataset.frame, chosen):
         seen = [c.name for c in frame.cameras if c.name in cameras and cameras[c.name].sees(frame, c.name)]
         if seen:
-            teaching.append((frame, lidar.detect(frame), {name: cameras[name].detect(frame, name) for name in seen}))
+            fused = aligned_frame(frame, alignment or {})
+            teaching.append((fused, lidar.detect(frame), {name: cameras[name].detect(frame, name) for name in seen}))
     calibration = self_calibrate(teaching, config)
     if len(chosen) < FEW_FRAMES:
         calibration = calibration.model_copy(update={"camera_classes": None})

@@ -1,0 +1,100 @@
+"""``lcf3d live``: a dataset as a stream through `lcf3d.live.Fuser`, in real time."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from lcf3d.errors import ConfigError
+
+if TYPE_CHECKING:
+    from lcf3d.live.replay import ReplayReport
+
+
+def live(
+    dataset: Annotated[str, typer.Argument(help="kitti:ROOT, nuscenes:ROOT or another installed kind")],
+    lidar: Annotated[str, typer.Option(help="LiDAR detector, kind:argument, for example results:DIR")],
+    camera: Annotated[str, typer.Option(help="camera detector of all cameras, kind:argument")],
+    rate: Annotated[float, typer.Option(min=0, help="times as fast as it was; 0 for as fast as possible")] = 1.0,
+    hertz: Annotated[float, typer.Option(min=0.1, help="frames a second where the dataset has no times")] = 10.0,
+    split: Annotated[str | None, typer.Option(help="split of the dataset; all frames if left out")] = None,
+    tables: Annotated[str | None, typer.Option(help="nuScenes: folder of tables; the only one if left out")] = None,
+    frames: Annotated[int | None, typer.Option(min=1, help="only so many frames from the first on")] = None,
+    config: Annotated[str | None, typer.Option(help="preset or YAML file; the dataset's if left out")] = None,
+    set_: Annotated[list[str] | None, typer.Option("--set", help="change a setting, name=value; repeatable")] = None,
+    recovery: Annotated[str | None, typer.Option(help="on or off; off needs no scans")] = None,
+    calibration: Annotated[str, typer.Option(help="score calibration: a file, auto, or none")] = "auto",
+    self_calibrate: Annotated[
+        bool, typer.Option("--self-calibrate", help="turn each camera as the calibration watch says")
+    ] = False,
+    health: Annotated[Path | None, typer.Option(help="write a JSON line of health after each second here")] = None,
+    json_: Annotated[bool, typer.Option("--json", help="print the report as JSON")] = False,
+) -> None:
+    """Replay a dataset in real time and watch latency, what is dropped, each sensor's health and calibration.
+
+    Examples:
+
+    lcf3d live kitti:KITTI --lidar results:pointrcnn --camera results:rrc_2d --rate 1.0
+
+    lcf3d live kitti:DRIVE --lidar shipped:kitti --camera shipped --self-calibrate
+    """
+    import json
+
+    from lcf3d.live.fuser import LiveResult
+    from lcf3d.live.replay import make_fuser, replay
+    from lcf3d.run.setup import RunRequest, find_calibration, make_fusion, read_inputs
+
+    request = RunRequest(
+        dataset, lidar, {"*": camera}, split=split, tables=tables, config=config, changes=tuple(set_ or ()),
+        recovery=recovery, calibration=calibration,
+    )  # fmt: skip
+    inputs = read_inputs(request)
+    frame_ids = inputs.frame_ids[:frames]
+    if not frame_ids:
+        raise ConfigError(f"{dataset} has no frames to replay")
+    scores = find_calibration(calibration, inputs.dataset, frame_ids, inputs.lidar, inputs.cameras, inputs.config)
+    fusion = make_fusion(inputs.config, inputs.localizer, scores)
+    first = inputs.dataset.frame(frame_ids[0])
+    fuser = make_fuser(fusion, inputs.lidar, inputs.cameras, first, realtime=rate > 0, correct=self_calibrate)
+    fuser.warm_up()
+    lines: list[str] = []
+    said = [0.0]
+
+    def write_health(results: list[LiveResult]) -> None:
+        if health is not None and results[-1].time - said[0] >= 1:
+            said[0] = results[-1].time
+            lines.append(json.dumps({"time": results[-1].time, "status": fuser.diagnostics()}))
+
+    report = replay(
+        inputs.dataset, frame_ids, inputs.lidar, inputs.cameras, fuser, rate=rate, hertz=hertz, on_results=write_health
+    )
+    if health is not None:
+        from lcf3d.files import write_text
+
+        write_text(health, "\n".join(lines) + "\n")
+    if json_:
+        typer.echo(json.dumps(report.to_json(), indent=2))
+    else:
+        _print(report)
+
+
+def _print(report: ReplayReport) -> None:
+    """The report for people."""
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console()
+    console.print(
+        f"{report.frames} frames in {report.seconds:.1f} s: {report.results} results, {report.behind} behind time"
+    )
+    table = Table("stage", "median ms", "99th percentile")
+    for part, values in report.latency_ms.items():
+        table.add_row(part, f"{values['median']:.2f}", f"{values['p99']:.2f}")
+    console.print(table)
+    for cause, count in report.dropped.items():
+        console.print(f"dropped, {cause}: {count}")
+    for status in report.diagnostics:
+        level = ("ok", "warning", "error", "silent")[status["level"]]
+        console.print(f"{status['hardware_id']}: {level}, {status['message']}", soft_wrap=True)

@@ -1,0 +1,375 @@
+"""One object for a stream: messages of all sensors in, fused boxes with latency and health out."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from lcf3d.detectors.base import CameraDetector, LidarDetector
+from lcf3d.errors import ConfigError
+from lcf3d.fusion.alignment_watch import AlignmentWatch, WatchSettings
+from lcf3d.fusion.pipeline import LateCascadeFusion
+from lcf3d.live.health import Health
+from lcf3d.live.messages import CameraBoxes, CameraModel, EgoPose, Image, LidarBoxes, Message, Scan, source_of
+from lcf3d.live.poses import PoseBuffer
+from lcf3d.live.synchronizer import CameraPart, Group, Synchronizer, SyncSettings
+from lcf3d.live.warming import warm_up
+from lcf3d.live.workers import Worker, attempt
+from lcf3d.provenance import FusedDetections
+from lcf3d.structures import Camera, Detections3D, FloatArray, Frame
+
+# what a detector believes to move more slowly than this is taken to stand (m/s)
+STANDING = 1.5
+
+
+@dataclass(frozen=True)
+class LiveSettings:
+    """Settings of a `Fuser` beyond those of the fusion.
+
+    Attributes:
+        sync: how messages are grouped.
+        realtime: run detectors in threads, newest first. Without it they run when a message is pushed and nothing is
+            left out for want of time: the same messages give the same results.
+        watch: settings of the calibration watch, None for no watch.
+        watch_period: seconds from one frame that the watch looks at to the next: those in between show the same.
+        correct: turn each camera as the watch says, and move it in time.
+        leave_out_blinded: do not use a camera that confirms far fewer LiDAR boxes than it used to.
+    """
+
+    sync: SyncSettings = field(default_factory=SyncSettings)
+    realtime: bool = False
+    watch: WatchSettings | None = field(default_factory=WatchSettings)
+    watch_period: float = 0.1
+    correct: bool = False
+    leave_out_blinded: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class LiveResult:
+    """The fusion of one moment.
+
+    Attributes:
+        time: of the scan, in the sensors' clock.
+        frame: what was fused: cameras as they stood at their own moments, scan and images if there were any.
+        fused: the result with its provenance; its notes say which cameras were left out.
+        latency_ms: ``wait`` (first LiDAR message to last part), ``fusion``, ``added`` (last part to result); and
+            ``detect SOURCE`` where detectors ran. Not the same from run to run.
+    """
+
+    time: float
+    frame: Frame
+    fused: FusedDetections
+    latency_ms: dict[str, float]
+
+
+class Fuser:
+    """Fuses a stream of messages.
+
+    Args:
+        fusion: the fusion, for example ``LateCascadeFusion(FusionConfig(class_names=...))``.
+        cameras: calibrated cameras; those that come later are pushed as `CameraModel`.
+        lidar_detector: runs on each `Scan`; without it `LidarBoxes` are pushed.
+        camera_detectors: run on each `Image`, by camera name; cameras without one push `CameraBoxes`.
+        settings: see `LiveSettings`.
+        on_result: called with each result as soon as it is there, before health and the watch take their time.
+
+    Raises:
+        ConfigError: a detector or offset of an unknown camera, when cameras are given.
+
+    Example:
+        >>> fuser = Fuser(LateCascadeFusion(), cameras)  # doctest: +SKIP
+        >>> for message in stream:  # doctest: +SKIP
+        ...     for result in fuser.push(message):
+        ...         print(result.time, result.fused.explain(0))
+    """
+
+    def __init__(
+        self,
+        fusion: LateCascadeFusion,
+        cameras: Sequence[Camera] = (),
+        *,
+        lidar_detector: LidarDetector | None = None,
+        camera_detectors: Mapping[str, CameraDetector] | None = None,
+        settings: LiveSettings | None = None,
+        on_result: Callable[[LiveResult], None] | None = None,
+    ) -> None:
+        self.fusion, self.settings = fusion, settings or LiveSettings()
+        self._on_result = on_result
+        self._models: dict[str, list[tuple[float, Camera]]] = {c.name: [(-np.inf, c)] for c in cameras}
+        self._detectors: dict[str, Any] = {f"camera {n}": d for n, d in (camera_detectors or {}).items()}
+        if lidar_detector is not None:
+            self._detectors["scan"] = lidar_detector
+        named = {*(camera_detectors or {}), *self.settings.sync.offsets}
+        if cameras and not named <= set(self._models):
+            raise ConfigError(
+                f"there is no camera {sorted(named - set(self._models))}; the cameras are {sorted(self._models)}"
+            )
+        self._sync = Synchronizer(self.settings.sync)
+        self._poses = PoseBuffer()
+        watch = self.settings.watch
+        self.watch = AlignmentWatch(fusion.config.class_names, watch) if watch is not None else None
+        self.health = Health(fusion.config.class_names)
+        self._workers: dict[str, Worker] = {}
+        self._detect_ms: dict[tuple[str, float], float] = {}
+        self._results: list[LiveResult] = []
+        self._watched = -np.inf
+        self._lock = threading.RLock()
+
+    def push(self, message: Message) -> list[LiveResult]:
+        """Take one message in; the results that are there by now and were not handed out before, in order of time."""
+        return self._locked(lambda: self._take(message, perf_counter()))
+
+    def poll(self) -> list[LiveResult]:
+        """Close the groups that have waited longer than the deadline by the own clock, though nothing more came."""
+        before = perf_counter() - self.settings.sync.deadline
+        return self._locked(lambda: self._sync.overdue(before))
+
+    def flush(self) -> list[LiveResult]:
+        """Fuse everything that is left, at the end of a stream; detectors at work are waited for up to the deadline."""
+        for worker in list(self._workers.values()):
+            worker.wait_idle(self.settings.sync.deadline)
+        return self._locked(lambda: None, everything=True)
+
+    def close(self) -> None:
+        """Stop the detectors' threads; one that hangs is left behind."""
+        for worker in self._workers.values():
+            worker.stop(self.settings.sync.deadline)
+        self._workers.clear()
+
+    def warm_up(self) -> None:
+        """Load, compile and run everything once on made-up input: the first real frame is then as quick as others."""
+        with self._lock:
+            warm_up(self.fusion, [self._model(name, np.inf) for name in self._models], self._detectors)
+
+    def dropped(self) -> dict[str, int]:
+        """Messages left out, by ``source: cause``."""
+        with self._lock:
+            return {f"{source}: {cause}": count for (source, cause), count in sorted(self._sync.dropped.items())}
+
+    def diagnostics(self) -> list[dict[str, Any]]:
+        """Health of every part as plain values in the form of ROS ``diagnostic_msgs/DiagnosticStatus``."""
+        with self._lock:
+            reports = {n: self.watch.report(n) for n in self.watch.cameras} if self.watch is not None else {}
+            hanging = {
+                name: perf_counter() - worker.busy_since
+                for name, worker in self._workers.items()
+                if worker.busy_since is not None
+            }
+            late = {name: s for name, s in hanging.items() if s > self.settings.sync.deadline}
+            return self.health.diagnostics(self._sync, reports, list(self._models), late)
+
+    def _locked(self, action: Callable[[], None], everything: bool = False) -> list[LiveResult]:
+        with self._lock:
+            action()
+            self._advance(everything)
+            results, self._results = self._results, []
+            return results
+
+    def _take(self, message: Message, arrival: float) -> None:
+        source = source_of(message)
+        if isinstance(message, CameraModel):
+            self._learn_camera(message)
+            return
+        if isinstance(message, Image | CameraBoxes) and message.camera not in self._models:
+            self.health.tell_once(f"camera {message.camera} has no calibration yet: its messages wait for one")
+        self.health.saw(source, message, arrival)
+        if not self._sync.admit(source, message.time):
+            return
+        if isinstance(message, EgoPose):
+            if np.shape(message.world_from_lidar) == (4, 4) and np.isfinite(message.world_from_lidar).all():
+                self._poses.add(message.time, message.world_from_lidar)
+            else:
+                self._sync.dropped[source, "broken"] += 1
+            return
+        if isinstance(message, Scan):
+            self._sync.add_scan(message.time, message.points, arrival)
+        if source in self._detectors and isinstance(message, Scan | Image):
+            self._detect(source, message, arrival)
+        elif isinstance(message, LidarBoxes):
+            self._sync.add_lidar(message.time, message.detections, arrival)
+        elif isinstance(message, CameraBoxes):
+            self._sync.add_camera(message.camera, CameraPart(message.time, message.detections, None, arrival))
+
+    def _learn_camera(self, message: CameraModel) -> None:
+        """A calibration that is new, or that changes in the middle.
+
+        Where it differs by more than the motion of a car between scan and image, the watch begins anew.
+        """
+        known = self._models.setdefault(message.camera.name, [])
+        anew = bool(known) and not _nearly(known[-1][1], message.camera)
+        if anew:
+            self.health.tell(f"camera {message.camera.name}: new calibration at {message.time:.3f} s")
+        known.append((message.time if known else -np.inf, message.camera))
+        known.sort(key=lambda entry: entry[0])
+        # those that no group to come can ask for
+        while len(known) > 1 and known[1][0] <= self._sync.closed:
+            known.pop(0)
+        if anew and self.watch is not None:
+            self.watch.forget(message.camera.name)
+
+    def _model(self, name: str, time: float) -> Camera:
+        """A camera as its calibration was at some time."""
+        valid = [camera for since, camera in self._models[name] if since <= time]
+        return valid[-1] if valid else self._models[name][0][1]
+
+    def _detect(self, source: str, message: Scan | Image, arrival: float) -> None:
+        """Run a detector now, or hand the message to its thread."""
+        detector = self._detectors[source]
+
+        def work(taken: tuple[Scan | Image, float]) -> Any:
+            given = taken[0]
+            return detector(given.points) if isinstance(given, Scan) else detector([given.pixels])[0]
+
+        if not self.settings.realtime:
+            start = perf_counter()
+            result, error = attempt(work, (message, arrival))
+            self._detected(source, message, result, error, (perf_counter() - start) * 1e3, arrival)
+            return
+        if source not in self._workers:
+
+            def done(taken: tuple[Scan | Image, float], result: Any, error: Exception | None, spent: float) -> None:
+                with self._lock:
+                    self._detected(source, taken[0], result, error, spent, taken[1])
+                    self._advance(False)
+
+            self._workers[source] = Worker(source, work, done)
+        if not self._workers[source].submit((message, arrival)):
+            self._sync.dropped[source, "busy"] += 1
+
+    def _detected(
+        self, source: str, message: Scan | Image, result: Any, error: Exception | None, spent: float, arrival: float
+    ) -> None:
+        """What a detector found, or that it failed."""
+        if error is not None:
+            self.health.failed(source, error)
+            return
+        self._detect_ms[source, message.time] = spent
+        if isinstance(message, Scan):
+            if message.time > self._sync.closed:
+                self._sync.add_lidar(message.time, result, arrival)
+            else:
+                self._sync.dropped["lidar", "late"] += 1
+        else:
+            self._sync.add_camera(message.camera, CameraPart(message.time, result, message.pixels, arrival))
+
+    def _advance(self, everything: bool) -> None:
+        """Fuse the groups that are ready."""
+        newest = self._poses.newest if self.settings.sync.poses else np.inf
+        for group in self._sync.ready(frozenset(self._models), newest, everything):
+            self._fuse(group)
+        if len(self._detect_ms) > 64:
+            for key in list(self._detect_ms)[:-64]:
+                del self._detect_ms[key]
+
+    def _fuse(self, group: Group) -> None:
+        assert group.lidar is not None
+        begun = perf_counter()
+        frame, nominal = self._frame(group)
+        blinded = self.health.blinded() if self.settings.leave_out_blinded else frozenset()
+        found = {n: p.detections for n, p in group.cameras.items() if n in self._models and n not in blinded}
+        result, error = attempt(lambda lidar: self.fusion(frame, lidar, found), group.lidar)
+        if error is not None:
+            self.health.failed("fusion", error)
+            return
+        result = replace(result, notes=(*result.notes, *self._notes(group, blinded)))
+        ended = perf_counter()
+        latency = {
+            "wait": (group.last_arrival - group.arrival) * 1e3,
+            "fusion": (ended - begun) * 1e3,
+            "added": (ended - group.last_arrival) * 1e3,
+            **self._detector_times(group),
+        }
+        live = LiveResult(group.time, frame, result, latency)
+        self._results.append(live)
+        if self._on_result is not None:
+            self._on_result(live)
+        self._look_after(group, frame, nominal, result, latency)
+
+    def _look_after(
+        self, group: Group, frame: Frame, nominal: Frame, result: FusedDetections, latency: dict[str, float]
+    ) -> None:
+        """What takes time and no result waits for: health and the calibration watch."""
+        assert group.lidar is not None
+        found = {name: part.detections for name, part in group.cameras.items() if name in self._models}
+        self.health.fused(frame, result, found, latency, group.points)
+        if self.watch is not None and not 0 <= group.time - self._watched < 0.9 * self.settings.watch_period:
+            self._watched = group.time
+            lidar = group.lidar
+            self.watch.observe(nominal, lidar, found, lambda ahead: self._relative_velocities(group.time, lidar, ahead))
+
+    def _frame(self, group: Group) -> tuple[Frame, Frame]:
+        """What is fused, with each camera as it stood at its own moment; and the same without corrections."""
+        nominal, corrected = [], []
+        for name in self._models:
+            camera = self._model(name, group.time)
+            part = group.cameras.get(name)
+            shift = 0.0 if part is None else part.time - group.time
+            nominal.append(self._moved(camera, group.time, shift))
+            if self.settings.correct and self.watch is not None:
+                late = self.watch.estimate(name).time_offset if self.watch.settings.time else 0.0
+                corrected.append(self.watch.corrected(self._moved(camera, group.time, shift + late)))
+        images = {n: p.pixels for n, p in group.cameras.items() if p.pixels is not None}
+        frame = Frame(
+            f"{group.time:.6f}",
+            group.points,
+            corrected or nominal,
+            images,
+            timestamp=group.time,
+            world_from_lidar=self._poses.at(group.time),
+        )
+        return frame, frame.with_cameras(nominal)
+
+    def _moved(self, camera: Camera, time: float, shift: float) -> Camera:
+        """A camera as it stood ``shift`` seconds after a scan, seen from the LiDAR at the scan."""
+        motion = self._poses.motion(time, time + shift) if shift else None
+        transform = camera.camera_from_lidar if motion is None else camera.camera_from_lidar @ motion
+        return replace(camera, camera_from_lidar=transform, delay=shift)
+
+    def _relative_velocities(self, time: float, lidar: Detections3D, ahead: float) -> FloatArray | None:
+        """(N, 3) m/s of boxes as seen from the moving LiDAR, in its axes, on average over some seconds after a scan.
+
+        None without poses or the wish for it. Less than 50 ms are taken as the 50 ms before the scan.
+        """
+        if self.watch is None or not self.watch.settings.time:
+            return None
+        step = ahead if abs(ahead) > 0.05 else -0.05
+        motion = self._poses.motion(time, time + step)
+        if motion is None:
+            return None
+        centres = lidar.boxes[:, :3]
+        relative = (centres @ motion[:3, :3].T + motion[:3, 3] - centres) / step
+        if lidar.velocities is not None:
+            moving = np.nan_to_num(lidar.velocities)
+            # noise in the velocities of things that stand would make every offset look smaller
+            relative[:, :2] += np.where(np.hypot(moving[:, :1], moving[:, 1:]) > STANDING, moving, 0)
+        return np.asarray(relative)
+
+    def _notes(self, group: Group, blinded: Iterable[str]) -> list[str]:
+        notes = [f"camera {n} sees far less than it used to and was not used" for n in sorted(blinded)]
+        notes += [
+            f"camera {n} has no calibration and was not used" for n in sorted(set(group.cameras) - {*self._models})
+        ]
+        if len(self._poses) and any(
+            p.time != group.time and self._poses.motion(group.time, p.time) is None for p in group.cameras.values()
+        ):
+            notes.append("there is no ego pose at this moment: nothing was moved to the cameras' times")
+        return notes
+
+    def _detector_times(self, group: Group) -> dict[str, float]:
+        times = {"scan": group.time, **{f"camera {n}": p.time for n, p in group.cameras.items()}}
+        return {f"detect {s}": self._detect_ms[s, t] for s, t in times.items() if (s, t) in self._detect_ms}
+
+
+def _nearly(camera: Camera, other: Camera) -> bool:
+    """Whether two calibrations are of one camera on a moving car: equal but for a turn by a degree or so."""
+    turn = camera.camera_from_lidar[:3, :3].T @ other.camera_from_lidar[:3, :3]
+    same = np.allclose(camera.projection, other.projection) and (camera.width, camera.height) == (
+        other.width,
+        other.height,
+    )
+    return bool(same and np.trace(turn) > 1 + 2 * np.cos(np.deg2rad(3.0)))

@@ -1,0 +1,72 @@
+"""What may be pushed into a stream: one frozen record a kind of message, times in seconds of the sensors' clock."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lcf3d.structures import Camera, Detections2D, Detections3D, FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """A LiDAR scan: (N, 4 or more) float32 points in the LiDAR frame at ``time``."""
+
+    time: float
+    points: NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class LidarBoxes:
+    """3D detections in the LiDAR frame at ``time``, that of their scan."""
+
+    time: float
+    detections: Detections3D
+
+
+@dataclass(frozen=True, eq=False)
+class Image:
+    """A (H, W, 3) uint8 RGB image of one camera."""
+
+    time: float
+    camera: str
+    pixels: NDArray[np.uint8]
+
+
+@dataclass(frozen=True, eq=False)
+class CameraBoxes:
+    """2D detections of one camera at ``time``, that of their image."""
+
+    time: float
+    camera: str
+    detections: Detections2D
+
+
+@dataclass(frozen=True, eq=False)
+class EgoPose:
+    """(4, 4) pose of the LiDAR in a frame that does not move."""
+
+    time: float
+    world_from_lidar: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class CameraModel:
+    """The calibration of one camera, for scans from ``time`` on; the first one serves all earlier scans too."""
+
+    time: float
+    camera: Camera
+
+
+Message = Scan | LidarBoxes | Image | CameraBoxes | EgoPose | CameraModel
+
+
+def source_of(message: Message) -> str:
+    """Name of the stream that a message belongs to: ``lidar``, ``scan``, ``pose`` or ``camera NAME``."""
+    if isinstance(message, Image | CameraBoxes):
+        return f"camera {message.camera}"
+    if isinstance(message, CameraModel):
+        return f"calibration {message.camera.name}"
+    return {Scan: "scan", LidarBoxes: "lidar", EgoPose: "pose"}[type(message)]

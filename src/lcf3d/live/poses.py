@@ -1,0 +1,71 @@
+"""Where the LiDAR was at any moment, from the ego poses of a stream."""
+
+from __future__ import annotations
+
+from bisect import bisect_left, insort
+
+import numpy as np
+
+from lcf3d.geometry.rotation import invert_rigid, quaternions_from_matrices, rigid_transforms
+from lcf3d.structures import FloatArray
+
+# beyond the newest pose the last motion is carried on for so long (seconds)
+CARRY_ON = 0.25
+# poses older than this before the newest are forgotten
+KEPT = 5.0
+
+
+class PoseBuffer:
+    """Ego poses by time, interpolated between two and carried on for a moment beyond the newest."""
+
+    def __init__(self) -> None:
+        self._times: list[float] = []
+        self._poses: dict[float, FloatArray] = {}
+
+    def __len__(self) -> int:
+        return len(self._times)
+
+    @property
+    def newest(self) -> float:
+        """Time of the newest pose, minus infinity without any."""
+        return self._times[-1] if self._times else -np.inf
+
+    def add(self, time: float, world_from_lidar: FloatArray) -> None:
+        """Take a pose in, in any order; a second one of the same time is left out."""
+        if time not in self._poses:
+            insort(self._times, time)
+            self._poses[time] = np.asarray(world_from_lidar, dtype=np.float64)
+        while self._times[0] < self._times[-1] - KEPT:
+            del self._poses[self._times.pop(0)]
+
+    def at(self, time: float) -> FloatArray | None:
+        """(4, 4) ``world_from_lidar`` at a moment; None where no poses are near enough."""
+        if not self._times:
+            return None
+        i = bisect_left(self._times, time)
+        if i < len(self._times) and self._times[i] == time:
+            return self._poses[time]
+        if len(self._times) < 2 or time < self._times[0] or time > self._times[-1] + CARRY_ON:
+            return None
+        i = min(max(i, 1), len(self._times) - 1)
+        before, after = self._times[i - 1], self._times[i]
+        return interpolated(self._poses[before], self._poses[after], (time - before) / (after - before))
+
+    def motion(self, earlier: float, later: float) -> FloatArray | None:
+        """(4, 4) ``lidar_at_later_from_lidar_at_earlier``; None where a pose is missing."""
+        first, second = self.at(earlier), self.at(later)
+        return None if first is None or second is None else np.asarray(invert_rigid(second) @ first)
+
+
+def interpolated(first: FloatArray, second: FloatArray, share: float) -> FloatArray:
+    """The (4, 4) pose that lies ``share`` of the way between two; beyond 1 the motion is carried on.
+
+    The normalised line between the quaternions is the great circle to a hundredth of a degree for small turns.
+    """
+    q = quaternions_from_matrices(np.stack([first[:3, :3], second[:3, :3]]))
+    if q[0] @ q[1] < 0:
+        q[1] = -q[1]
+    turned = (1 - share) * q[0] + share * q[1]
+    moved = (1 - share) * first[:3, 3] + share * second[:3, 3]
+    pose: FloatArray = rigid_transforms(turned[None], moved[None])[0]
+    return pose

@@ -1,0 +1,256 @@
+import threading
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from lcf3d.errors import ConfigError
+from lcf3d.fusion.alignment import realigned
+from lcf3d.fusion.alignment_watch import WatchSettings
+from lcf3d.live.messages import CameraBoxes, CameraModel, EgoPose, Image, LidarBoxes, Scan
+from lcf3d.live.synchronizer import SyncSettings
+from lcf3d.structures import Frame
+from tests.fusion.scenes import camera
+from tests.live.streams import boxes2d, boxes3d, fingerprint, fuser, fusion, pose, run, stream, street
+
+
+def entry(target, name):
+    return next(e for e in target.diagnostics() if e["hardware_id"] == name)
+
+
+def value(target, name, key):
+    return next(v["value"] for v in entry(target, name)["values"] if v["key"] == key)
+
+
+def test_a_stream_gives_the_boxes_that_files_would_give():
+    view, offline = camera(), fusion()
+    results = run(fuser(), stream(10))
+    assert len(results) == 10
+    for i, result in enumerate(results):
+        frame = Frame(str(i), cameras=[view])
+        expected = offline(frame, boxes3d(street(i)), {"left": boxes2d(view, street(i))})
+        assert np.array_equal(result.fused.detections.boxes, expected.detections.boxes)
+        assert np.array_equal(result.fused.detections.scores, expected.detections.scores)
+        assert set(result.latency_ms) == {"wait", "fusion", "added"}
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.integers(0, 10_000))
+def test_any_order_of_arrival_inside_the_tolerance_gives_the_same_bytes(seed):
+    views = [camera("left"), camera("right", yaw=-0.2)]
+    messages = list(stream(8, views)) + [pose(0.05 * i, 0.4 * i) for i in range(18)]
+    messages.sort(key=lambda m: m.time)
+    expected = fingerprint(run(fuser(views), messages))
+    jitter = np.random.default_rng(seed).uniform(0, 0.04, len(messages))
+    shuffled = [messages[i] for i in np.argsort([m.time + j for m, j in zip(messages, jitter, strict=True)])]
+    assert fingerprint(run(fuser(views, poses=True), shuffled)) == fingerprint(run(fuser(views, poses=True), messages))
+    assert len(expected) > 0
+
+
+def test_a_camera_that_is_late_is_left_out_and_said():
+    messages = [m for m in stream(5) if not (isinstance(m, CameraBoxes) and 0.15 < m.time < 0.25)]
+    target = fuser()
+    results = run(target, messages)
+    assert [len(r.fused.camera_names) for r in results] == [1, 1, 0, 1, 1]
+    assert "camera left" in results[2].fused.notes[0]
+    assert value(target, "camera left", "absent") == "1"
+
+
+def test_an_offset_says_when_a_camera_looks():
+    messages = list(stream(5, delay=0.05))
+    assert all(not r.fused.camera_names for r in run(fuser(), messages))
+    assert all(r.fused.camera_names == ("left",) for r in run(fuser(offsets={"left": 0.05}), messages))
+
+
+def test_boxes_are_moved_to_the_moment_of_each_camera():
+    view = camera()
+    # the car drives 20 m/s towards a standing box: 0.03 s later it is 0.6 m nearer
+    there, nearer = street(0, 1), street(0, 1) - [0.6, 0, 0, 0, 0, 0, 0]
+    target = fuser(poses=True)
+    messages = [
+        pose(0.0, 0.0),
+        pose(0.1, 2.0),
+        LidarBoxes(0.0, boxes3d(there)),
+        CameraBoxes(0.03, "left", boxes2d(view, nearer)),
+    ]
+    (result,) = run(target, messages)
+    assert result.fused.lidar.iou[0] == pytest.approx(1.0, abs=1e-6)
+    assert np.allclose(result.fused.detections.boxes, there)
+    # nothing moves but the box itself, at 20 m/s towards us
+    target = fuser()
+    messages = [LidarBoxes(0.0, boxes3d(there, [[-20.0, 0.0]])), CameraBoxes(0.03, "left", boxes2d(view, nearer))]
+    (result,) = run(target, messages)
+    assert result.fused.lidar.iou[0] == pytest.approx(1.0, abs=1e-6)
+
+
+def test_without_a_pose_for_the_moment_the_result_says_so():
+    target = fuser(poses=True)
+    (result,) = run(target, [EgoPose(0.0, np.eye(4)), *stream(1)])
+    assert any("no ego pose" in note for note in result.fused.notes)
+
+
+def test_clocks_minutes_apart_are_said_once_with_the_number_and_the_lidar_goes_on():
+    view = camera()
+    messages = []
+    for i in range(5):
+        messages += [
+            LidarBoxes(0.1 * i, boxes3d(street(i))),
+            CameraBoxes(0.1 * i + 180, "left", boxes2d(view, street(i))),
+        ]
+    target = fuser()
+    results = run(target, messages)
+    assert len(results) == 5
+    assert all(not r.fused.camera_names for r in results)
+    assert entry(target, "camera left")["level"] == 2
+    assert entry(target, "camera left")["message"].count("+180.0 s") == 1
+
+
+def test_time_that_goes_back_begins_anew():
+    target = fuser()
+    results = run(target, [*stream(4, start=100.0), *stream(4, start=0.0)])
+    assert len(results) >= 7
+    assert value(target, "fusion", "restarts") == "1"
+    assert results[-1].fused.camera_names == ("left",)
+
+
+def test_broken_times_and_poses_are_counted_and_nothing_stops():
+    target = fuser()
+    bad = [LidarBoxes(np.nan, boxes3d(street(0))), EgoPose(0.05, np.full((4, 4), np.nan)), EgoPose(0.06, np.eye(3))]
+    results = run(target, [*list(stream(2)), *bad, *stream(2, start=0.2)])
+    assert len(results) == 4
+    assert value(target, "lidar", "dropped") == "1"
+
+
+def test_a_calibration_may_come_late_and_change():
+    view, turned = camera(), realigned(camera(), np.array([0.0, 0.1, 0.0]))
+    messages = []
+    for i in range(6):
+        seen = turned if i >= 4 else view
+        messages += [LidarBoxes(0.1 * i, boxes3d(street(i))), CameraBoxes(0.1 * i, "left", boxes2d(seen, street(i)))]
+    messages.insert(4, CameraModel(0.15, view))
+    messages.insert(9, CameraModel(0.35, turned))
+    target = fuser([])
+    results = run(target, messages)
+    assert [len(r.fused.camera_names) for r in results] == [0, 0, 1, 1, 1, 1]
+    assert all(np.nanmin(r.fused.lidar.iou) > 0.99 for r in results[2:])
+    notes = value(target, "fusion", "notes")
+    assert "no calibration yet" in notes
+    assert "new calibration at 0.350 s" in notes
+
+
+def test_detectors_run_on_scans_and_images_in_order():
+    view = camera()
+    pixels = np.zeros((400, 1000, 3), np.uint8)
+    points = np.zeros((5, 4), np.float32)
+    target = fuser(
+        detectors={"left": lambda images: [boxes2d(view, street(0)) for _ in images]},
+        lidar_detector=lambda cloud: boxes3d(street(0)),
+    )
+    messages = [m for i in range(3) for m in (Scan(0.1 * i, points), Image(0.1 * i + 0.01, "left", pixels))]
+    results = run(target, messages)
+    assert len(results) == 3
+    assert all(r.fused.camera_names == ("left",) for r in results)
+    assert {"detect scan", "detect camera left"} <= set(results[0].latency_ms)
+    assert results[0].frame.images["left"] is pixels
+
+
+def test_a_detector_that_raises_is_reported_and_the_rest_goes_on():
+    def broken(images):
+        raise RuntimeError("no memory")
+
+    target = fuser(detectors={"left": broken})
+    pixels = np.zeros((4, 4, 3), np.uint8)
+    messages = [m for i in range(4) for m in (LidarBoxes(0.1 * i, boxes3d(street(i))), Image(0.1 * i, "left", pixels))]
+    results = run(target, messages)
+    assert len(results) == 4
+    assert "failed 4 times, last RuntimeError: no memory" in entry(target, "camera left")["message"]
+
+
+def test_a_detector_that_hangs_costs_the_deadline_and_drops_what_waited():
+    release, pixels = threading.Event(), np.zeros((4, 4, 3), np.uint8)
+
+    def hanging(images):
+        release.wait(20)
+        return [boxes2d(camera(), street(0))]
+
+    target = fuser(realtime=True, detectors={"left": hanging}, deadline=0.1)
+    results = []
+    for i in range(6):
+        results += target.push(LidarBoxes(0.1 * i, boxes3d(street(i))))
+        results += target.push(Image(0.1 * i, "left", pixels))
+    import time
+
+    time.sleep(0.12)
+    results += target.poll()
+    assert len(results) == 6
+    assert all(not r.fused.camera_names for r in results)
+    message = entry(target, "camera left")["message"]
+    assert "has not answered" in message
+    assert "dropped (busy)" in message
+    release.set()
+    target.close()
+
+
+def test_results_of_threads_come_through_the_callback():
+    view, came = camera(), []
+    target = fuser(
+        realtime=True,
+        on_result=came.append,
+        detectors={"left": lambda images: [boxes2d(view, street(0))]},
+        deadline=5.0,
+    )
+    target.push(LidarBoxes(0.0, boxes3d(street(0))))
+    target.push(Image(0.0, "left", np.zeros((4, 4, 3), np.uint8)))
+    target.flush()
+    assert [r.fused.camera_names for r in came] == [("left",)]
+    target.close()
+
+
+def test_an_overflow_of_groups_is_counted():
+    target = fuser(deadline=100.0, most_pending=3)
+    results = run(target, [LidarBoxes(0.1 * i, boxes3d(street(i))) for i in range(10)])
+    assert len(results) == 3
+    assert "7 messages dropped (overflow)" in entry(target, "lidar")["message"]
+
+
+def test_scores_that_are_no_probabilities_stop_no_stream():
+    target = fuser()
+    bad = boxes3d(street(0))
+    object.__setattr__(bad, "scores", np.array([3.0, 2.0, 1.0, 0.5]))
+    results = run(target, [LidarBoxes(0.0, bad), *stream(2, start=0.1)])
+    assert len(results) == 2
+    assert "could not be fused" in entry(target, "fusion")["message"]
+
+
+def test_the_watch_corrects_a_turned_camera():
+    view = camera()
+    real = realigned(view, np.deg2rad([0, 2.0, 0]))
+    rng = np.random.default_rng(0)
+    messages = []
+    for i in range(30):
+        boxes = street(i, 6) + np.column_stack([rng.uniform(-2, 2, (6, 2)), np.zeros((6, 5))])
+        messages += [LidarBoxes(0.1 * i, boxes3d(boxes)), CameraBoxes(0.1 * i, "left", boxes2d(real, boxes))]
+    target = fuser(watch=WatchSettings(), correct=True)
+    results = run(target, messages)
+    assert np.nanmean(results[-1].fused.lidar.iou) > 0.95
+    assert np.nanmean(results[0].fused.lidar.iou) < 0.8
+    assert "turned by 2.0" in entry(target, "camera left")["message"]
+    assert entry(target, "camera left")["level"] == 2
+
+
+def test_warm_up_runs_everything_without_a_result():
+    calls = []
+    target = fuser(detectors={"left": lambda images: calls.append(images) or [boxes2d(camera(), street(0))]})
+    target.warm_up()
+    assert calls[0][0].shape == (400, 1000, 3)
+    assert target.flush() == []
+
+
+def test_settings_that_cannot_work_are_refused():
+    with pytest.raises(ConfigError, match="deadline"):
+        SyncSettings(tolerance=0.1, deadline=0.1)
+    with pytest.raises(ConfigError, match="above 0"):
+        SyncSettings(tolerance=0.0)
+    with pytest.raises(ConfigError, match="no camera"):
+        fuser(offsets={"rear": 0.01})

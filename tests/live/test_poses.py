@@ -1,0 +1,45 @@
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from lcf3d.live.poses import PoseBuffer
+
+
+def pose(x, yaw):
+    transform = np.eye(4)
+    transform[:3, :3] = Rotation.from_euler("z", yaw).as_matrix()
+    transform[0, 3] = x
+    return transform
+
+
+def test_between_two_poses_half_of_the_way_and_of_the_turn():
+    buffer = PoseBuffer()
+    buffer.add(1.1, pose(2.0, 0.02))
+    buffer.add(1.0, pose(0.0, 0.0))  # the order does not matter
+    assert np.allclose(buffer.at(1.05), pose(1.0, 0.01), atol=1e-6)
+    assert np.allclose(buffer.at(1.1), pose(2.0, 0.02))
+
+
+def test_the_last_motion_is_carried_on_for_a_moment_only():
+    buffer = PoseBuffer()
+    for time in (0.0, 0.1):
+        buffer.add(time, pose(20 * time, 0.0))
+    assert buffer.at(0.2)[0, 3] == pytest.approx(4.0)
+    assert buffer.at(0.6) is None
+    assert buffer.at(-0.01) is None
+    assert PoseBuffer().at(0.0) is None
+
+
+def test_a_point_that_stands_comes_nearer_as_the_car_drives():
+    buffer = PoseBuffer()
+    buffer.add(0.0, pose(0.0, 0.0))
+    buffer.add(0.1, pose(1.0, 0.0))
+    assert np.allclose(buffer.motion(0.0, 0.1) @ [10, 0, 0, 1], [9, 0, 0, 1])
+
+
+def test_old_poses_are_forgotten():
+    buffer = PoseBuffer()
+    for i in range(200):
+        buffer.add(0.1 * i, np.eye(4))
+    assert len(buffer) <= 52
+    assert buffer.newest == pytest.approx(19.9)
