@@ -31,8 +31,6 @@ FRONT = {"kitti": "left", "nuscenes": "CAM_FRONT"}
 """Front camera by kind of dataset."""
 
 LIDAR_ALONE, FUSED = "LiDAR", "fused"
-# frames that a calibration without labels looks at
-_TEACHING_FRAMES = 400
 _KEYS = ("lidar", "camera", "fused", "split", "calibration")
 _EXAMPLE = "'kitti->nuscenes nuscenes:ROOT lidar=results:FILE camera=results:FILE split=mini_val'"
 
@@ -168,11 +166,13 @@ class DomainTaskRunner:
         truths: list[Truth] = []
         cameras: list[Camera] = []
         found: dict[str, list[Detections3D]] = {LIDAR_ALONE: []}
+        adapted = isinstance(self.lidar, AdaptedLidar | AdaptedFrames)
         fusion = (
             LateCascadeFusion(
                 self.config,
                 calibration=find_calibration(
-                    self.task.calibration,
+                    # a detector that runs here gives probabilities
+                    "none" if adapted and self.task.calibration == "auto" else self.task.calibration,
                     self.dataset,
                     self.dataset.ids,
                     _InKittiClasses(self.lidar),
