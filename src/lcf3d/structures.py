@@ -54,6 +54,9 @@ ARGOVERSE_CLASSES = (
 
 def _array(value: ArrayLike, dtype: Any, shape: tuple[int | None, ...], what: str) -> NDArray[Any]:
     """``value`` as a read-only array of ``dtype``; ``None`` in ``shape`` is any length; empty input is accepted."""
+    if hasattr(value, "detach"):
+        # a tensor of torch, which may be on a GPU and want a gradient
+        value = value.detach().cpu().numpy()
     array = np.array(value, dtype=dtype)
     if array.size == 0 and array.ndim <= len(shape):
         array = array.reshape([0 if n is None else n for n in shape])

@@ -114,7 +114,7 @@ def ablation_table(rows: Sequence[AblationRow], evaluation: Evaluation, frames: 
     columns = ("mean", *(_short(name) for name in names)) if wide else tuple(names)
     notes = () if scans else ("not every frame has a LiDAR scan: rows with detection recovery are left out",)
     title = f"{evaluation.heading}, {' '.join(evaluation.columns)}, on {frames} frames"
-    return TableData(title, ("variant", *columns, "matched", "recovered", "kept"), cells, notes)
+    return TableData(title, ("variant", *columns, "mat-\nched", "reco-\nvered", "kept"), cells, notes)
 
 
 def _short(name: str) -> str:

@@ -20,8 +20,8 @@ def console() -> Console:
     from rich.console import Console
 
     out = Console(markup=False, highlight=False)
-    # a pipe or file has no width of its own; wide enough that no line of a table is folded
-    return out if out.is_terminal else Console(markup=False, highlight=False, width=max(out.width, 100))
+    # a pipe or file has no width of its own: wide enough that no line of a table is folded
+    return out if out.is_terminal else Console(markup=False, highlight=False, width=max(out.width, 140))
 
 
 def print_table(table: TableData) -> None:
@@ -30,7 +30,8 @@ def print_table(table: TableData) -> None:
 
     shown = Table(title=table.title, title_justify="left", box=None, padding=(0, 1, 0, 0), pad_edge=False)
     for number, column in enumerate(table.columns):
-        shown.add_column(column, justify="right" if number else "left", no_wrap=True)
+        # where a terminal is too narrow, names are folded and numbers stay whole
+        shown.add_column(column, justify="right" if number else "left", no_wrap=bool(number), overflow="fold")
     bold = False
     for row in table.rows:
         if row is None:

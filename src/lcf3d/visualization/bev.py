@@ -37,12 +37,14 @@ class BevView:
         height: of the picture in pixels.
         pixels_per_metre: scale.
         origin: pixel (column, row) of the LiDAR.
+        reach: metres from the LiDAR to the farthest thing that is drawn: rings end there.
     """
 
     width: int
     height: int
     pixels_per_metre: float
     origin: tuple[float, float]
+    reach: float = FARTHEST
 
     @classmethod
     def fit(cls, boxes: FloatArray, cameras: Sequence[Camera], width: int, height: int) -> BevView:
@@ -61,7 +63,9 @@ class BevView:
         # what a side has too much is shared by both ends, but ahead goes to the front
         spare = np.array([width, height]) - scale * (high - low)
         column = -low[0] * scale + (0 if ahead else spare[0] / 2)
-        return cls(width, height, scale, (float(column), float(high[1] * scale + spare[1] / 2)))
+        away = np.hypot(boxes[:, 0], boxes[:, 1]).max(initial=20.0) + MARGIN
+        reach = float(min(away, np.hypot(FARTHEST, FARTHEST)))
+        return cls(width, height, scale, (float(column), float(high[1] * scale + spare[1] / 2)), reach)
 
     def pixels(self, points: FloatArray) -> FloatArray:
         """(..., 2) pixels of (..., 2) ground positions x, y."""
@@ -87,7 +91,8 @@ def draw_bev(
     canvas = Canvas(_point_picture(points, view))
     if points is None:
         canvas.text(6, 4, "no scan", _RING_TEXT)
-    _draw_rings(canvas, view)
+    seen = 0.0 if points is None or not len(points) else float(np.hypot(points[:, 0], points[:, 1]).max())
+    _draw_rings(canvas, view, max(view.reach, min(seen, FARTHEST)))
     for camera in cameras:
         canvas.lines(_field_of_view(camera, view), _VIEW, width=1.0)
     if scene.truth is not None:
@@ -123,12 +128,13 @@ def _point_picture(points: NDArray[np.float32] | None, view: BevView) -> PIL.Ima
     return PIL.Image.fromarray(picture)
 
 
-def _draw_rings(canvas: Canvas, view: BevView) -> None:
+def _draw_rings(canvas: Canvas, view: BevView, reach: float) -> None:
+    """Rings as far as there is something, and the LiDAR in their middle."""
     corners = np.array([[0, 0], [view.width, 0], [0, view.height], [view.width, view.height]]) - view.origin
     farthest = float(np.hypot(*corners.T).max()) / view.pixels_per_metre
     angles = np.linspace(0, 2 * np.pi, 181)
     circle = np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    for radius in np.arange(RING_STEP, farthest, RING_STEP):
+    for radius in np.arange(RING_STEP, min(farthest, reach + RING_STEP), RING_STEP):
         ring = view.pixels(radius * circle)
         canvas.lines(np.concatenate([ring[:-1], ring[1:]], axis=1), _RING, width=1.0, opacity=0.7)
         canvas.text(*_ring_label(radius, view), f"{radius:.0f} m", _RING_TEXT, size=10)

@@ -32,21 +32,23 @@ def draw_frame(frame: Frame, scene: Scene, cameras: Sequence[str] | None = None,
     Args:
         frame: images and points; either may be missing.
         scene: what to draw over them, see `Scene.from_fused`.
-        cameras: names of those to show; all that have an image if None, or the first one if none has.
+        cameras: names of those to show; all that have an image if None. Where none has, a single camera (or the first
+            of a pair) is drawn without its image, and of several cameras only the bird's-eye view.
         bev: whether the bird's-eye view is drawn.
 
     Returns:
         RGB picture.
     """
     shown = _shown_cameras(frame, cameras)
+    around = shown or frame.cameras
     panels = _camera_panels(frame, shown, scene)
     width = max((sum(panel.width for panel in row) for row in panels), default=GRID_WIDTH)
     rows = [_beside(row) for row in panels]
     if bev:
-        height = BEV_HEIGHT if len(shown) < 3 else SURROUND_BEV_HEIGHT
+        height = BEV_HEIGHT if len(around) < 3 else SURROUND_BEV_HEIGHT
         everything = scene.boxes if scene.truth is None else np.concatenate([scene.boxes, scene.truth])
-        view = BevView.fit(everything, shown, width, height)
-        rows.append(draw_bev(frame.points, shown, scene, view))
+        view = BevView.fit(everything, around, width, height)
+        rows.append(draw_bev(frame.points, around, scene, view))
     return _stack([_legend(frame.id, scene, width), *rows])
 
 
@@ -60,7 +62,7 @@ def _shown_cameras(frame: Frame, names: Sequence[str] | None) -> list[Camera]:
     if names is not None:
         return [frame.camera(name) for name in names]
     with_image = [camera for camera in frame.cameras if camera.name in frame.images]
-    return with_image or list(frame.cameras[:1])
+    return with_image or (list(frame.cameras[:1]) if len(frame.cameras) < 3 else [])
 
 
 def _camera_panels(frame: Frame, cameras: Sequence[Camera], scene: Scene) -> list[list[PIL.Image.Image]]:
