@@ -98,14 +98,30 @@ def _row(timing: Timing) -> dict[str, Any]:
     return {"stage": values.pop("name"), **values, **speed}
 
 
-def _print(rows: list[dict[str, Any]]) -> None:
-    from rich.console import Console
-    from rich.table import Table
+_SHORT = {
+    "stage": "stage",
+    "name": "network",
+    "runtime": "runtime",
+    "median_ms": "ms",
+    "budget_ms": "wanted",
+    "reference_ms": "other\nms",
+    "times_faster": "times\nfaster",
+    "per_second": "per\nsecond",
+    "memory_mb": "MB",
+    "gflops": "GFLOP",
+    "parameters_m": "Mpar",
+}
+"""Headings that leave room for the figures in a terminal of 80 columns."""
 
-    table = Table(*(column.replace("_", " ") for column in rows[0]))
-    for row in rows:
-        table.add_row(*(_text(value) for value in row.values()))
-    Console().print(table)
+
+def _print(rows: list[dict[str, Any]]) -> None:
+    from lcf3d.cli.console import print_table
+    from lcf3d.evaluation.protocol import TableData
+
+    # columns that hold nothing are left out
+    names = [name for name in rows[0] if any(row[name] is not None for row in rows)]
+    columns = tuple(_SHORT.get(name, name.replace("_", "\n")) for name in names)
+    print_table(TableData("", columns, [tuple(_text(row[name]) for name in names) for row in rows]))
 
 
 def _text(value: Any) -> str:
