@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from lcf3d.fusion.calibration import Calibration
     from lcf3d.fusion.config import FusionConfig
     from lcf3d.fusion.evidence import Evidence
+    from lcf3d.fusion.memory import remember_sequence
     from lcf3d.fusion.pipeline import LateCascadeFusion
     from lcf3d.fusion.self_calibration import self_calibrate
     from lcf3d.fusion.stereo import StereoConfig, StereoLateCascadeFusion
@@ -80,6 +81,7 @@ _LAZY = {
     "read_detections_2d": "formats.plain",
     "read_detections_3d": "formats.plain",
     "read_run": "api",
+    "remember_sequence": "fusion.memory",
     "run": "api",
     "self_calibrate": "fusion.self_calibration",
     "to_classes": "detectors.classes",
@@ -130,6 +132,7 @@ __all__ = [
     "read_detections_2d",
     "read_detections_3d",
     "read_run",
+    "remember_sequence",
     "run",
     "self_calibrate",
     "to_classes",

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from enum import IntEnum
 from typing import Any
 
 import numpy as np
 
-from lcf3d.structures import Detections2D, Detections3D, FloatArray, IntArray
+from lcf3d.structures import BoolArray, Detections2D, Detections3D, FloatArray, IntArray
 
 
 class Outcome(IntEnum):
@@ -19,6 +19,7 @@ class Outcome(IntEnum):
     RECOVERED = 1
     KEPT = 2
     DROPPED = 3
+    PREDICTED = 4
 
 
 class Reason(IntEnum):
@@ -173,6 +174,51 @@ class Decisions:
 
 
 @dataclass(frozen=True, eq=False)
+class TrackTable:
+    """What the memory of past frames says of the outputs, one row an output, see `lcf3d.fusion.memory`.
+
+    Attributes:
+        ids: number of the track, the same in every frame of a sequence.
+        ages_s: seconds since it was first seen.
+        hits: number of frames that saw it, this one included.
+        unseen_s: seconds since it was last seen; 0 for what this frame sees, more for predicted boxes.
+        support: what past frames say for it, see `lcf3d.fusion.memory_evidence`.
+        log_odds: log-odds that the memory added; those of the whole box for predicted ones.
+    """
+
+    ids: IntArray
+    ages_s: FloatArray
+    hits: IntArray
+    unseen_s: FloatArray
+    support: FloatArray
+    log_odds: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def __getitem__(self, index: Any) -> TrackTable:
+        """The rows selected by a slice, an integer array or a boolean mask."""
+        return TrackTable(*(getattr(self, column.name)[index] for column in fields(self)))
+
+    @property
+    def predicted(self) -> BoolArray:
+        """(N,) the boxes that no detection of this frame led to."""
+        return self.unseen_s > 0
+
+    def to_json(self) -> dict[str, list[Any]]:
+        """Columns as plain JSON values."""
+        return {column.name: np.round(getattr(self, column.name), 5).tolist() for column in fields(self)}
+
+    @classmethod
+    def from_json(cls, value: dict[str, list[Any]]) -> TrackTable:
+        """The inverse of `to_json`."""
+        columns: dict[str, Any] = {name: np.array(values) for name, values in value.items()}
+        for name in columns:
+            columns[name] = columns[name].astype(np.int64 if name in ("ids", "hits") else np.float64)
+        return cls(**columns)
+
+
+@dataclass(frozen=True, eq=False)
 class FusedDetections:
     """Result of the fusion of one frame.
 
@@ -184,6 +230,7 @@ class FusedDetections:
         camera_inputs: the 2D detections that were given, by position in ``camera_names``.
         camera_names: the cameras that were used.
         notes: what was missing or left out, one sentence each.
+        tracks: what the memory says of the outputs; None where frames are judged alone.
     """
 
     detections: Detections3D
@@ -193,6 +240,7 @@ class FusedDetections:
     camera_inputs: tuple[Detections2D, ...]
     camera_names: tuple[str, ...]
     notes: tuple[str, ...] = ()
+    tracks: TrackTable | None = None
 
     def __post_init__(self) -> None:
         for table in (self.lidar, self.camera):
@@ -201,6 +249,21 @@ class FusedDetections:
     def __len__(self) -> int:
         return len(self.detections)
 
+    def reordered(self, detections: Detections3D, order: IntArray, tracks: TrackTable) -> FusedDetections:
+        """The same inputs with other outputs.
+
+        Args:
+            detections: the new outputs.
+            order: (N,) for each of them which output it was; numbers from the old count on are of outputs that no
+                input led to.
+            tracks: of the new outputs.
+        """
+        place = np.empty(len(order) + 1, dtype=np.int64)
+        place[order] = np.arange(len(order))
+        place[-1] = -1  # no output before, none now
+        tables = [replace(table, output=place[table.output]) for table in (self.lidar, self.camera)]
+        return replace(self, detections=detections, lidar=tables[0], camera=tables[1], tracks=tracks)
+
     @property
     def outcomes(self) -> IntArray:
         """(N,) `Outcome` of every output."""
@@ -208,6 +271,8 @@ class FusedDetections:
         for table in (self.camera, self.lidar):
             led = table.output >= 0
             outcomes[table.output[led]] = table.outcome[led]
+        if self.tracks is not None:
+            outcomes[self.tracks.predicted] = Outcome.PREDICTED
         return outcomes
 
     @property
@@ -218,9 +283,26 @@ class FusedDetections:
 
     def explain(self, output: int) -> str:
         """One sentence on why output ``output`` is there, with the numbers that decided."""
-        table, row = self._origin(output)
         label = self.detections.class_names[self.detections.labels[output]]
-        return f"{label} {self.detections.scores[output]:.2f}, {self._because(table, row)}"
+        score = f"{label} {self.detections.scores[output]:.2f}"
+        if self.tracks is None:
+            return f"{score}, {self._because(*self._origin(output))}"
+        past = self._past_text(self.tracks, output)
+        if self.tracks.predicted[output]:
+            return f"{score}, predicted: no detection of this frame shows it, but {past}"
+        return f"{score}, {self._because(*self._origin(output))}; {past}"
+
+    @staticmethod
+    def _past_text(tracks: TrackTable, output: int) -> str:
+        """The memory of an output in words."""
+        track = f"track {tracks.ids[output]}"
+        if tracks.hits[output] == 1:
+            return f"{track} begins here ({tracks.log_odds[output]:+.2f} log-odds)"
+        ago = f", the last {tracks.unseen_s[output]:.1f} s ago" if tracks.predicted[output] else ""
+        return (
+            f"{track} was seen in {tracks.hits[output]} frames over {tracks.ages_s[output]:.1f} s{ago} "
+            f"(support {tracks.support[output]:.1f}, {tracks.log_odds[output]:+.2f} log-odds)"
+        )
 
     def explain_lidar(self, index: int) -> str:
         """One sentence on what became of LiDAR detection ``index`` of those given."""
@@ -263,7 +345,9 @@ class FusedDetections:
 
     def to_json(self) -> dict[str, Any]:
         """Provenance as plain JSON values; read back with `from_json`."""
+        tracks = {} if self.tracks is None else {"tracks": self.tracks.to_json()}
         return {
+            **tracks,
             "cameras": list(self.camera_names),
             "notes": list(self.notes),
             "detections": _detections_to_json(self.detections),
@@ -284,6 +368,7 @@ class FusedDetections:
             camera_inputs=tuple(Detections2D(**_detections_from_json(d)) for d in value["camera_inputs"]),
             camera_names=tuple(value["cameras"]),
             notes=tuple(value["notes"]),
+            tracks=TrackTable.from_json(value["tracks"]) if "tracks" in value else None,
         )
 
 

@@ -35,6 +35,9 @@ def eval(
     tables: Annotated[str | None, typer.Option(help="nuScenes: folder of tables; the only one if left out")] = None,
     front: Annotated[bool, typer.Option("--front", help="only what the front camera sees (not KITTI)")] = False,
     nds_hat: Annotated[bool, typer.Option("--nds-hat", help="NDS^: no velocity, no attributes")] = False,
+    tracking: Annotated[
+        bool, typer.Option("--tracking", help="tracks of 'lcf3d run --memory' or of another tracker (KITTI)")
+    ] = False,
     json_: Annotated[bool, typer.Option("--json", help="print the metrics as JSON")] = False,
 ) -> None:
     """Measure results against ground truth.
@@ -44,6 +47,8 @@ def eval(
     Example: lcf3d eval kitti:KITTI --compare results/pointpillars fused
 
     Example: lcf3d eval nuscenes:NUSCENES results.json
+
+    Example: lcf3d eval kitti:KITTI_TRACKING fused --tracking
     """
     import json
 
@@ -53,6 +58,13 @@ def eval(
     from lcf3d.evaluation.protocol import EvaluationOptions, open_evaluation
 
     _check(results, compare, out)
+    if tracking:
+        from lcf3d.cli.eval_tracking import eval_tracking
+
+        if compare or out is not None:
+            raise ConfigError("--tracking measures one result and writes no report; leave out --compare and --out")
+        eval_tracking(dataset, results[0].expanduser(), tuple(class_ or ()), json_)
+        return
     require_missing(missing)
     options = EvaluationOptions(tuple(class_ or ()), tuple(iou or ()), front, nds_hat)
     split, frames, whole = _frames_of_run(results[0], split)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -47,6 +48,12 @@ def run(
     self_calibrate: Annotated[
         bool, typer.Option("--self-calibrate", help="turn cameras as the matches of the whole drive say")
     ] = False,
+    memory: Annotated[
+        bool, typer.Option("--memory", help="let recent frames of a drive testify too, and give tracks")
+    ] = False,
+    smooth: Annotated[
+        bool, typer.Option("--smooth", help="as --memory, and later frames testify as well; not for live use")
+    ] = False,
     jobs: Annotated[int, typer.Option(min=1, help="processes")] = 1,
     pictures: Annotated[bool, typer.Option("--pictures", help="also draw every frame")] = False,
     resume: Annotated[bool, typer.Option("--resume", help="continue a run that was interrupted")] = False,
@@ -83,10 +90,17 @@ def run(
         calibration=calibration,
         missing=missing,
         self_calibrate=self_calibrate,
+        memory=memory,
+        smooth=smooth,
     )
     prepared = prepare_run(request, out, resume=resume, overwrite=overwrite)
-    pending = [frame_id for frame_id in prepared.frame_ids if not prepared.folder.is_done(frame_id)]
-    summaries = _fuse(prepared, pending, jobs, quiet=json_)
+    sequences = _sequences(prepared) if memory or smooth else None
+    pending = (
+        [frame_id for frame_id in prepared.frame_ids if not prepared.folder.is_done(frame_id)]
+        if sequences is None
+        else [frame_id for sequence in sequences for frame_id in sequence]
+    )
+    summaries = _fuse(prepared, pending, jobs, sequences, quiet=json_)
     prepared.folder.finish(prepared.frame_ids)
     if pictures:
         _draw(prepared, quiet=json_)
@@ -106,7 +120,16 @@ def _cameras(camera: str | None, left: str | None, right: str | None) -> dict[st
     raise ConfigError("name the camera branch with --camera, or with both --camera-left and --camera-right")
 
 
-def _fuse(prepared: Run, pending: list[str], jobs: int, quiet: bool) -> list[FrameSummary]:
+def _sequences(prepared: Run) -> list[Sequence[str]]:
+    """The sequences that are still to be run, each in order of time."""
+    from lcf3d.run.sequences import in_order, pending
+
+    return pending(in_order(prepared.dataset, prepared.frame_ids), prepared.folder.is_done)
+
+
+def _fuse(
+    prepared: Run, pending: list[str], jobs: int, sequences: list[Sequence[str]] | None, quiet: bool
+) -> list[FrameSummary]:
     """Run the frames under a progress bar."""
     from rich.progress import Progress
 
@@ -115,7 +138,7 @@ def _fuse(prepared: Run, pending: list[str], jobs: int, quiet: bool) -> list[Fra
     summaries = []
     with Progress(disable=quiet) as progress:
         task = progress.add_task("fusing", total=len(pending))
-        for summary in run_frames(prepared.runner, pending, jobs):
+        for summary in run_frames(prepared.runner, pending, jobs, sequences):
             summaries.append(summary)
             progress.advance(task)
     return summaries

@@ -18,8 +18,10 @@ from numpy.typing import NDArray
 from lcf3d.datasets.base import BaseDataset, CameraSource, LidarSource, ResultWriter, require_folder
 from lcf3d.datasets.check import Finding
 from lcf3d.datasets.images import ImageFiles, image_size
+from lcf3d.datasets.kitti_sequences import FRAMES_PER_S, lidar_pose, sequence_of
 from lcf3d.errors import DatasetError, FormatError
 from lcf3d.formats.kitti import detections_3d, read_frame_ids, read_objects
+from lcf3d.formats.kitti_drives import read_camera_poses
 from lcf3d.structures import KITTI_CLASSES, Camera, Detections3D, FloatArray, Frame
 
 # (camera name, image folder, projection in the calibration file)
@@ -256,6 +258,7 @@ class KittiDataset(KittiLikeDataset):
         self.class_names = tuple(class_names)
         self.default_image_size = image_size
         self.split = split
+        self._poses_read: dict[str, FloatArray | None] = {}
         self._listed = () if split is None else read_frame_ids(self._split_path(split))
         self.folder = self.root / (part or self._part_of(self._listed))
         if not self.folder.is_dir():
@@ -344,10 +347,22 @@ class KittiDataset(KittiLikeDataset):
             assert label is not None
             return detections_3d(read_objects(label, results=False), calibration.camera_from_lidar, self.class_names)
 
+        sequence, number = sequence_of(frame_id)
+        poses = None if sequence is None else self._poses(sequence)
         return Frame(
             frame_id,
             points=(lambda: read_points(scan)) if scan else None,
             cameras=cameras_of(calibration, images, {}, self.default_image_size),
             images=ImageFiles(images),
             labels=labels if label else None,
+            timestamp=None if sequence is None else number / FRAMES_PER_S,
+            world_from_lidar=None if poses is None else lidar_pose(poses, number, calibration.camera_from_lidar),
+            sequence=sequence,
         )
+
+    def _poses(self, sequence: str) -> FloatArray | None:
+        """(F, 4, 4) first camera from the camera of each frame of a sequence, read once; None without the file."""
+        if sequence not in self._poses_read:
+            path = self.root / "poses" / f"{sequence}.txt"
+            self._poses_read[sequence] = read_camera_poses(path) if path.is_file() else None
+        return self._poses_read[sequence]

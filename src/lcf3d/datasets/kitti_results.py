@@ -8,6 +8,7 @@ from typing import Literal
 
 import numpy as np
 
+from lcf3d.datasets.kitti_sequences import sequence_of
 from lcf3d.errors import ConfigError, DatasetError
 from lcf3d.formats.kitti import (
     KittiObjects,
@@ -15,8 +16,10 @@ from lcf3d.formats.kitti import (
     detections_3d,
     objects_from_detections,
     read_folder,
+    read_objects,
     write_objects,
 )
+from lcf3d.formats.kitti_tracking import write_tracks
 from lcf3d.geometry.camera import project_boxes
 from lcf3d.provenance import FusedDetections
 from lcf3d.structures import Detections2D, Detections3D, FloatArray, Frame
@@ -105,12 +108,15 @@ class KittiCameraResults(KittiResults):
 class KittiWriter:
     """Writes ``data/ID.txt``, a KITTI result file, for every frame.
 
+    A run with memory also gets ``tracks/SEQUENCE.txt``, KITTI tracking results.
+
     Args:
         folder: of the run.
     """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder / "data"
+        self.tracks = folder / "tracks"
 
     def write(self, frame: Frame, fused: FusedDetections) -> None:
         """Write the result file of a frame."""
@@ -123,11 +129,24 @@ class KittiWriter:
         return (self.folder / f"{frame_id}.txt").is_file()
 
     def finish(self, frame_ids: Sequence[str], read: Callable[[str], FusedDetections]) -> None:
-        """Nothing belongs to all frames together."""
+        """Write the tracks, where there are any, of the frames whose ids tell sequence and number."""
+        sequences: dict[str, list[tuple[int, str]]] = {}
+        for frame_id in frame_ids:
+            sequence, number = sequence_of(frame_id)
+            if sequence is not None:
+                sequences.setdefault(sequence, []).append((number, frame_id))
+        for sequence, frames in sequences.items():
+            numbers, names = zip(*sorted(frames), strict=True)
+            tables = [read(name).tracks for name in names]
+            ids = [table.ids for table in tables if table is not None]
+            if len(ids) == len(names):
+                objects = [read_objects(self.folder / f"{name}.txt", results=True) for name in names]
+                write_tracks(self.tracks / f"{sequence}.txt", numbers, ids, objects)
 
     def written(self) -> Iterator[Path]:
-        """The files of all frames."""
+        """The files of all frames, and the tracks."""
         yield from sorted(self.folder.glob("[!.]*.txt"))
+        yield from sorted(self.tracks.glob("[!.]*.txt"))
 
 
 def image_boxes(frame: Frame, fused: FusedDetections) -> FloatArray:

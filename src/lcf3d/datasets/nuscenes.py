@@ -33,6 +33,7 @@ from lcf3d.formats.nuscenes_boxes import (
     global_from_detections,
     split_by_sample,
 )
+from lcf3d.formats.nuscenes_tracking import write_tracking
 from lcf3d.geometry.rotation import invert_rigid, rigid_transforms
 from lcf3d.structures import NUSCENES_CLASSES, Camera, Detections3D, FloatArray, Frame, IntArray, Sweep
 
@@ -184,7 +185,7 @@ class NuscenesDataset(BaseDataset):
         """One submission of all samples."""
         from lcf3d.datasets.nuscenes_results import NuscenesWriter
 
-        return NuscenesWriter(folder, self.write_results)
+        return NuscenesWriter(folder, self.write_results, self.write_tracks)
 
     @staticmethod
     def check_unreadable(root: str, version: str | None = None) -> list[Finding]:
@@ -295,6 +296,17 @@ class NuscenesDataset(BaseDataset):
         """
         transforms = {token: self.global_from_lidar(token) for token in detections if token in self._position}
         write_submission(path, global_from_detections(detections, transforms, self.ids), meta)
+
+    def write_tracks(self, path: Path, detections: Mapping[str, Detections3D], ids: Mapping[str, IntArray]) -> None:
+        """Write tracked detections, given in canonical LiDAR frames by sample token, as a tracking submission.
+
+        Raises:
+            FormatError: values that are not finite.
+        """
+        transforms = {token: self.global_from_lidar(token) for token in detections}
+        names, scenes = self.tables.scene_names, self.tables.samples.scenes
+        of = {token: names[int(scenes[self._sample_row(token)])] for token in detections}
+        write_tracking(path, detections, ids, of, transforms, self.ids)
 
     def _sample_row(self, token: str) -> int:
         if token not in self._position:

@@ -8,7 +8,7 @@ from pathlib import Path
 from lcf3d.errors import FormatError
 from lcf3d.formats.coco import read_camera_detections
 from lcf3d.provenance import FusedDetections
-from lcf3d.structures import Detections2D, Detections3D, Frame
+from lcf3d.structures import Detections2D, Detections3D, Frame, IntArray
 
 
 class NuscenesLidarResults:
@@ -74,14 +74,24 @@ class NuscenesCameraResults:
 class NuscenesWriter:
     """Writes ``results.json``, one submission of all samples; samples that were not run have no boxes in it.
 
+    A run with memory also gets ``tracking.json``, a tracking submission.
+
     Args:
         folder: of the run.
         write_results: writes detections by sample token, in canonical LiDAR frames, to a file.
+        write_tracks: the same for detections and the track of each.
     """
 
-    def __init__(self, folder: Path, write_results: Callable[[Path, Mapping[str, Detections3D]], None]) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        write_results: Callable[[Path, Mapping[str, Detections3D]], None],
+        write_tracks: Callable[[Path, Mapping[str, Detections3D], Mapping[str, IntArray]], None],
+    ) -> None:
         self.path = folder / "results.json"
+        self.tracking_path = folder / "tracking.json"
         self._write_results = write_results
+        self._write_tracks = write_tracks
 
     def write(self, frame: Frame, fused: FusedDetections) -> None:
         """Nothing belongs to a single frame."""
@@ -91,10 +101,17 @@ class NuscenesWriter:
         return True
 
     def finish(self, frame_ids: Sequence[str], read: Callable[[str], FusedDetections]) -> None:
-        """Write the submission."""
-        self._write_results(self.path, {frame_id: read(frame_id).detections for frame_id in frame_ids})
+        """Write the submission, and the tracks where there are any."""
+        detections, ids = {}, {}
+        for frame_id in frame_ids:
+            fused = read(frame_id)
+            detections[frame_id] = fused.detections
+            if fused.tracks is not None:
+                ids[frame_id] = fused.tracks.ids
+        self._write_results(self.path, detections)
+        if ids:
+            self._write_tracks(self.tracking_path, {frame_id: detections[frame_id] for frame_id in ids}, ids)
 
     def written(self) -> Iterator[Path]:
-        """The submission."""
-        if self.path.is_file():
-            yield self.path
+        """The submissions."""
+        yield from (path for path in (self.path, self.tracking_path) if path.is_file())

@@ -71,7 +71,7 @@ class KittiObjects:
     @classmethod
     def empty(cls, results: bool) -> KittiObjects:
         """No objects, with scores if ``results``."""
-        return _from_table(np.zeros(0, np.str_), np.zeros((0, 15 if results else 14)))
+        return objects_from_table(np.zeros(0, np.str_), np.zeros((0, 15 if results else 14)))
 
     @property
     def has_box3d(self) -> NDArray[np.bool_]:
@@ -338,10 +338,10 @@ def _starts(counts: Sequence[int]) -> IntArray:
 def _read_files(paths: Sequence[Path | None], results: bool) -> tuple[KittiObjects, list[int]]:
     """All objects of the files, one after the other, and how many each file holds; None stands for an empty file."""
     names, values, counts = parse_files(paths, RESULT_COLUMNS if results else LABEL_COLUMNS)
-    return _from_table(names, values), counts
+    return objects_from_table(names, values), counts
 
 
-def _from_table(names: NDArray[np.str_], values: FloatArray) -> KittiObjects:
+def objects_from_table(names: NDArray[np.str_], values: FloatArray) -> KittiObjects:
     """Objects from the (N, 14) or, with scores, (N, 15) numbers that follow the class name."""
     values.setflags(write=False)
     return KittiObjects(

@@ -13,6 +13,10 @@ from typing import Any, Protocol
 from lcf3d.datasets.base import CameraSource, Dataset, LidarSource
 from lcf3d.errors import DatasetError
 from lcf3d.fusion.alignment import Alignment
+from lcf3d.fusion.memory import remember
+from lcf3d.fusion.memory_config import MemoryConfig
+from lcf3d.fusion.memory_smooth import smooth_sequence
+from lcf3d.fusion.memory_state import Memory
 from lcf3d.provenance import FusedDetections, Outcome, Reason
 from lcf3d.run.alignment import aligned_frame
 from lcf3d.run.folder import RunFolder
@@ -37,7 +41,7 @@ class FrameSummary:
         outputs: fused detections by outcome and class, for example ``("recovered", "Pedestrian")``.
         dropped: LiDAR detections dropped, by reason.
         notes: what was missing or left out.
-        milliseconds: by part: ``lidar``, ``camera``, ``fusion``, ``write``.
+        milliseconds: by part: ``lidar``, ``camera``, ``fusion``, ``memory`` where there is one, ``write``.
     """
 
     frame_id: str
@@ -58,6 +62,9 @@ class FrameRunner:
         fusion: the fusion.
         folder: where results go.
         alignment: how cameras stand beside what their calibration says, by name.
+        memory: settings of the memory of past frames; None to judge every frame alone. Frames are then to come in the
+            order of `lcf3d.run.sequences.in_order`.
+        smooth: whether later frames testify too, see `lcf3d.fusion.memory_smooth`.
     """
 
     dataset: Dataset
@@ -66,9 +73,38 @@ class FrameRunner:
     fusion: Fusion
     folder: RunFolder
     alignment: Mapping[str, Alignment] = field(default_factory=dict)
+    memory: MemoryConfig | None = None
+    smooth: bool = False
+    _remembered: dict[str | None, Memory | None] = field(default_factory=dict, init=False, repr=False)
 
     def __call__(self, frame_id: str) -> FrameSummary:
-        """Fuse one frame and write its files."""
+        """Fuse one frame, add what the memory of its sequence says, and write its files."""
+        frame, fused, spent = self._fuse(frame_id)
+        if self.memory is not None:
+            before = perf_counter()
+            past = self._remembered.get(frame.sequence)
+            seen = aligned_frame(frame, self.alignment)
+            self._remembered[frame.sequence], fused = remember(past, fused, seen, self.memory)
+            spent["memory"] = (perf_counter() - before) * 1e3
+        return self._write(frame, fused, spent)
+
+    def run_sequence(self, frame_ids: Sequence[str]) -> Iterator[FrameSummary]:
+        """The frames of one sequence, in order of time; with ``smooth`` all are fused before the first is written."""
+        if self.memory is None or not self.smooth:
+            yield from map(self, frame_ids)
+            return
+        done = []
+        for frame_id in frame_ids:
+            _, fused, spent = self._fuse(frame_id)
+            # the frame anew, so that no scan of the sequence stays in memory
+            done.append((self.dataset.frame(frame_id), fused, spent))
+        pairs = [(aligned_frame(frame, self.alignment), fused) for frame, fused, _ in done]
+        smoothed = smooth_sequence(pairs, self.memory)
+        for (frame, _, spent), fused in zip(done, smoothed, strict=True):
+            yield self._write(frame, fused, spent)
+
+    def _fuse(self, frame_id: str) -> tuple[Frame, FusedDetections, dict[str, float]]:
+        """One frame, its fused detections judged alone, and the milliseconds of each part."""
         marks = [perf_counter()]
         frame = self.dataset.frame(frame_id)
         lidar = self.lidar.detect(frame)
@@ -77,14 +113,18 @@ class FrameRunner:
         marks.append(perf_counter())
         fused = self._with_missing(self.fusion(aligned_frame(frame, self.alignment), lidar, camera), frame)
         marks.append(perf_counter())
+        parts = zip(("lidar", "camera", "fusion"), marks[:-1], marks[1:], strict=True)
+        return frame, fused, {name: (b - a) * 1e3 for name, a, b in parts}
+
+    def _write(self, frame: Frame, fused: FusedDetections, spent: dict[str, float]) -> FrameSummary:
+        """Write the files of a frame and sum up what happened to it."""
+        before = perf_counter()
         self.folder.write(frame, fused)
-        marks.append(perf_counter())
-        parts = ("lidar", "camera", "fusion", "write")
-        spent = {name: (b - a) * 1e3 for name, a, b in zip(parts, marks[:-1], marks[1:], strict=True)}
+        spent["write"] = (perf_counter() - before) * 1e3
         # a camera that this run was never to use is nothing to report
         unused = tuple(f"camera {camera.name} " for camera in frame.cameras if camera.name not in self.cameras)
         notes = tuple(note for note in fused.notes if not note.startswith(unused))
-        return replace(summarize(frame_id, fused, spent), notes=notes)
+        return replace(summarize(frame.id, fused, spent), notes=notes)
 
     def _with_missing(self, fused: FusedDetections, frame: Frame) -> FusedDetections:
         """The same with a note on what the run uses and this frame lacks: cameras, or what the LiDAR detector wants."""
@@ -138,27 +178,34 @@ def _start_worker(runner: FrameRunner) -> None:
     _worker = runner
 
 
-def _work(frame_id: str) -> FrameSummary:
-    return _worker(frame_id)
+def _work(frame_ids: Sequence[str]) -> list[FrameSummary]:
+    return list(_worker.run_sequence(frame_ids))
 
 
-def run_frames(runner: FrameRunner, frame_ids: Sequence[str], jobs: int = 1) -> Iterator[FrameSummary]:
+def run_frames(
+    runner: FrameRunner, frame_ids: Sequence[str], jobs: int = 1, sequences: Sequence[Sequence[str]] | None = None
+) -> Iterator[FrameSummary]:
     """Summaries of the frames in order, as they are done.
 
     Args:
         runner: what to do with a frame.
         frame_ids: the frames.
         jobs: processes; more than one pays where no detector runs, since those use all cores themselves.
+        sequences: the same frames in groups that must not be taken apart; any frame can be apart without.
     """
     if jobs <= 1:
-        yield from map(runner, frame_ids)
+        for sequence in [frame_ids] if sequences is None else sequences:
+            yield from runner.run_sequence(sequence)
         return
+    if sequences is None:
+        size = max(1, min(16, len(frame_ids) // (4 * jobs)))
+        sequences = [frame_ids[start : start + size] for start in range(0, len(frame_ids), size)]
     # by fork, so that results read once are shared and not sent
     context = get_context("fork")
-    chunk = max(1, min(16, len(frame_ids) // (4 * jobs)))
     with ProcessPoolExecutor(jobs, mp_context=context, initializer=_start_worker, initargs=(runner,)) as pool:
         try:
-            yield from pool.map(_work, frame_ids, chunksize=chunk)
+            for done in pool.map(_work, sequences):
+                yield from done
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise

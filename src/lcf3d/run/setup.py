@@ -16,6 +16,7 @@ from lcf3d.fusion.alignment import Alignment
 from lcf3d.fusion.calibration import Calibration, load_calibration
 from lcf3d.fusion.config import FusionConfig
 from lcf3d.fusion.localizer import Localizer
+from lcf3d.fusion.memory_config import MemoryConfig
 from lcf3d.fusion.pipeline import LateCascadeFusion
 from lcf3d.fusion.self_calibration import self_calibrate
 from lcf3d.fusion.stereo import StereoConfig, StereoLateCascadeFusion
@@ -55,6 +56,8 @@ class RunRequest:
         calibration: file of ``lcf3d calibrate``, ``auto`` or ``none``.
         self_calibrate: turn each camera as the matches of the whole drive say, see `lcf3d.run.alignment`.
         missing: result files that are not there: ``error`` or ``empty``.
+        memory: whether recent frames of a sequence testify too, see `lcf3d.fusion.memory`.
+        smooth: whether later ones do as well, see `lcf3d.fusion.memory_smooth`.
     """
 
     dataset: str
@@ -71,6 +74,8 @@ class RunRequest:
     calibration: str = "auto"
     missing: str = "error"
     self_calibrate: bool = False
+    memory: bool = False
+    smooth: bool = False
 
 
 class Inputs(NamedTuple):
@@ -117,7 +122,9 @@ def prepare_run(
     """
     dataset, frame_ids, config, lidar, cameras, localizer = read_inputs(request, settings=settings)
     folder = RunFolder(out, dataset.writer(out))
-    runner = FrameRunner(dataset, lidar, cameras, make_fusion(config, localizer), folder)
+    memory = MemoryConfig() if request.memory or request.smooth else None
+    fusion = make_fusion(config, localizer)
+    runner = FrameRunner(dataset, lidar, cameras, fusion, folder, memory=memory, smooth=request.smooth)
     from lcf3d import __version__
 
     # checked before anything is written; with results in files this is quick

@@ -1,0 +1,276 @@
+"""How well tracks follow objects: CLEAR MOT, the 3D measures over recall (sAMOTA, AMOTA, AMOTP), and HOTA.
+
+All of them work on overlaps: what overlaps how much is decided beforehand, once, by whoever knows the data
+(`lcf3d.evaluation.kitti_tracking`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from lcf3d.structures import FloatArray, IntArray
+
+# recall positions of the averaged measures: 1/40, 2/40, ..., 1
+RECALLS = 40
+# overlaps at which HOTA is computed and averaged
+ALPHAS = np.arange(0.05, 0.99, 0.05)
+
+
+@dataclass(frozen=True, eq=False)
+class TrackedFrames:
+    """Truth and output of one class over one sequence, one entry a frame.
+
+    Attributes:
+        truth: (G,) track of each object that counts.
+        found: (P,) track of each output that counts.
+        scores: (P,) score of each output's whole track.
+        overlaps: (G, P) overlap of objects and outputs, 0 to 1.
+    """
+
+    truth: Sequence[IntArray]
+    found: Sequence[IntArray]
+    scores: Sequence[FloatArray]
+    overlaps: Sequence[FloatArray]
+
+    def above(self, score: float) -> TrackedFrames:
+        """The same without the tracks of a lower score."""
+        kept = [scores >= score for scores in self.scores]
+        return TrackedFrames(
+            self.truth,
+            [own[k] for own, k in zip(self.found, kept, strict=True)],
+            [own[k] for own, k in zip(self.scores, kept, strict=True)],
+            [own[:, k] for own, k in zip(self.overlaps, kept, strict=True)],
+        )
+
+
+class Clear(NamedTuple):
+    """CLEAR MOT counts over some sequences.
+
+    Attributes:
+        objects: ground-truth boxes.
+        hits: of them, those found.
+        misses: those not found.
+        false_alarms: outputs that are no object.
+        switches: times that an object's track changed its number.
+        fragments: times that an object was found again after it was lost.
+        overlap: summed over the hits.
+    """
+
+    objects: int
+    hits: int
+    misses: int
+    false_alarms: int
+    switches: int
+    fragments: int
+    overlap: float
+
+    @property
+    def mota(self) -> float:
+        """Accuracy, percent: 1 minus errors by object; NaN without objects."""
+        errors = self.misses + self.false_alarms + self.switches
+        return 100 * (1 - errors / self.objects) if self.objects else float("nan")
+
+    @property
+    def motp(self) -> float:
+        """Precision, percent: mean overlap of the hits; NaN without any."""
+        return 100 * self.overlap / self.hits if self.hits else float("nan")
+
+    def smoothed_mota(self, recall: float) -> float:
+        """sMOTA at a recall (AB3DMOT, equation 4), percent, 0 to 100: misses that the recall implies are no errors."""
+        errors = self.misses + self.false_alarms + self.switches - (1 - recall) * self.objects
+        return 100 * float(np.clip(1 - errors / (recall * self.objects), 0, 1))
+
+
+class Averaged(NamedTuple):
+    """Measures averaged over the recall, percent, and the operating point of the best MOTA.
+
+    Attributes:
+        samota: mean sMOTA.
+        amota: mean MOTA, recall positions that are not reached count 0.
+        amotp: mean MOTP, likewise.
+        best: counts at the threshold of the best MOTA.
+        threshold: that threshold, on the tracks' scores.
+    """
+
+    samota: float
+    amota: float
+    amotp: float
+    best: Clear
+    threshold: float
+
+
+class Hota(NamedTuple):
+    """HOTA and its parts, percent, averaged over ``ALPHAS``.
+
+    Attributes:
+        hota: higher order tracking accuracy.
+        deta: detection accuracy.
+        assa: association accuracy.
+        loca: mean overlap of the hits.
+    """
+
+    hota: float
+    deta: float
+    assa: float
+    loca: float
+
+
+def clear(sequences: Sequence[TrackedFrames], min_overlap: float, keep: bool = True) -> Clear:
+    """Counts over some sequences.
+
+    Args:
+        sequences: truth and output.
+        min_overlap: a hit overlaps so much at least.
+        keep: prefer the output that an object was matched with before (CLEAR MOT); otherwise every frame is assigned
+            by overlap alone and a switch needs two frames in a row, as in KITTI's program and AB3DMOT's.
+    """
+    total = np.zeros(7)
+    for sequence in sequences:
+        total += _clear_of(sequence, min_overlap, keep)
+    objects, hits, misses, false_alarms, switches, fragments = (int(count) for count in total[:6])
+    return Clear(objects, hits, misses, false_alarms, switches, fragments, float(total[6]))
+
+
+def _clear_of(sequence: TrackedFrames, min_overlap: float, keep: bool) -> FloatArray:
+    """(7,) counts of one sequence, see `Clear`."""
+    last: dict[int, int] = {}  # output track that each object was last matched with
+    previous: dict[int, int] = {}  # the same in the frame before only
+    objects = hits = false_alarms = switches = fragments = 0
+    overlap = 0.0
+    for truth, found, overlaps in zip(sequence.truth, sequence.found, sequence.overlaps, strict=True):
+        objects += len(truth)
+        reference = last if keep else previous
+        gain = np.where(overlaps >= min_overlap, overlaps, 0.0)
+        if keep and len(truth) and len(found):
+            again = found[None] == np.array([previous.get(int(g), -1) for g in truth])[:, None]
+            gain = np.where(gain > 0, gain + 1000.0 * again, 0.0)
+        rows, columns = _assigned(gain)
+        now: dict[int, int] = {}
+        for g, p in zip(truth[rows].tolist(), found[columns].tolist(), strict=True):
+            now[g] = p
+            switches += reference.get(g, p) != p
+            fragments += g in last and g not in previous
+        hits += len(rows)
+        false_alarms += len(found) - len(rows)
+        overlap += float(overlaps[rows, columns].sum())
+        last.update(now)
+        if not keep or (len(truth) and len(found)):
+            previous = now
+    return np.array([objects, hits, objects - hits, false_alarms, switches, fragments, overlap])
+
+
+def _assigned(gain: FloatArray) -> tuple[IntArray, IntArray]:
+    """Rows and columns of the assignment of highest gain, pairs without gain left out."""
+    rows, columns = linear_sum_assignment(gain, maximize=True)
+    good = gain[rows, columns] > 0
+    return rows[good], columns[good]
+
+
+def averaged(sequences: Sequence[TrackedFrames], min_overlap: float) -> Averaged:
+    """sAMOTA, AMOTA and AMOTP over 40 recall positions (AB3DMOT), thresholds taken from the scores of the hits."""
+    objects = sum(len(truth) for sequence in sequences for truth in sequence.truth)
+    hits = np.concatenate([np.zeros(0), *(_hit_scores(sequence, min_overlap) for sequence in sequences)])
+    thresholds, recalls = _thresholds(np.sort(hits)[::-1], objects)
+    smoothed = mota = motp = 0.0
+    best, threshold = clear([s.above(np.inf) for s in sequences], min_overlap, keep=False), np.inf
+    for score, recall in zip(thresholds, recalls, strict=True):
+        counts = clear([sequence.above(score) for sequence in sequences], min_overlap, keep=False)
+        smoothed += counts.smoothed_mota(recall)
+        mota += counts.mota
+        motp += counts.motp
+        if counts.mota > best.mota:
+            best, threshold = counts, score
+    return Averaged(smoothed / RECALLS, mota / RECALLS, motp / RECALLS, best, threshold)
+
+
+def _hit_scores(sequence: TrackedFrames, min_overlap: float) -> FloatArray:
+    """Scores of the outputs that are hits when nothing is left out."""
+    scores = [np.zeros(0)]
+    for overlaps, own in zip(sequence.overlaps, sequence.scores, strict=True):
+        _, columns = _assigned(np.where(overlaps >= min_overlap, overlaps, 0.0))
+        scores.append(own[columns])
+    return np.concatenate(scores)
+
+
+def _thresholds(scores: FloatArray, objects: int) -> tuple[list[float], list[float]]:
+    """Scores at which the recall is nearest to each position, and the positions; ``scores`` fall."""
+    thresholds, recalls = [], []
+    position = 0.0
+    for i, score in enumerate(scores):
+        here = (i + 1) / objects
+        following = (i + 2) / objects if i < len(scores) - 1 else here
+        if following - position < position - here and i < len(scores) - 1:
+            continue
+        thresholds.append(float(score))
+        recalls.append(position)
+        position += 1 / RECALLS
+    return thresholds[1 : RECALLS + 1], recalls[1 : RECALLS + 1]
+
+
+def hota(sequences: Sequence[TrackedFrames]) -> Hota:
+    """Higher order tracking accuracy (Luiten et al. 2021) over some sequences."""
+    hits, misses, false_alarms, association, overlap = (np.zeros(len(ALPHAS)) for _ in range(5))
+    for sequence in sequences:
+        parts = _hota_of(sequence)
+        for total, part in zip((hits, misses, false_alarms, association, overlap), parts, strict=True):
+            total += part
+    detection = hits / np.maximum(hits + misses + false_alarms, 1)
+    associated = association / np.maximum(hits, 1)
+    located = np.where(hits > 0, overlap / np.maximum(hits, 1e-9), 1.0)
+    means = (np.sqrt(detection * associated), detection, associated, located)
+    return Hota(*(100 * float(values.mean()) for values in means))
+
+
+def _hota_of(sequence: TrackedFrames) -> tuple[FloatArray, ...]:
+    """(A,) hits, misses, false alarms, summed association and overlap of one sequence at each of ``ALPHAS``."""
+    truth_ids, truth = _numbered(sequence.truth)
+    found_ids, found = _numbered(sequence.found)
+    shared = np.zeros((truth_ids, found_ids))
+    truth_count, found_count = np.zeros(truth_ids), np.zeros(found_ids)
+    for g, p, overlaps in zip(truth, found, sequence.overlaps, strict=True):
+        truth_count[g] += 1
+        found_count[p] += 1
+        total = overlaps.sum(axis=0)[None] + overlaps.sum(axis=1)[:, None] - overlaps
+        share = np.divide(overlaps, total, out=np.zeros_like(overlaps), where=total > 0)
+        shared[np.ix_(g, p)] += share
+    joint = truth_count[:, None] + found_count[None] - shared
+    alignment = np.divide(shared, joint, out=np.zeros_like(shared), where=joint > 0)
+    hits, misses, false_alarms, overlap = (np.zeros(len(ALPHAS)) for _ in range(4))
+    matched = np.zeros((len(ALPHAS), truth_ids, found_ids), dtype=np.int32)
+    for g, p, overlaps in zip(truth, found, sequence.overlaps, strict=True):
+        rows, columns = linear_sum_assignment(alignment[np.ix_(g, p)] * overlaps, maximize=True)
+        value = overlaps[rows, columns]
+        for a, alpha in enumerate(ALPHAS):
+            good = value >= alpha - 1e-12
+            hits[a] += good.sum()
+            misses[a] += len(g) - good.sum()
+            false_alarms[a] += len(p) - good.sum()
+            overlap[a] += value[good].sum()
+            matched[a, g[rows[good]], p[columns[good]]] += 1
+    association = np.zeros(len(ALPHAS))
+    for a in range(len(ALPHAS)):
+        rows, columns = np.nonzero(matched[a])
+        count = matched[a, rows, columns].astype(np.float64)
+        association[a] = (count * count / (truth_count[rows] + found_count[columns] - count)).sum()
+    return hits, misses, false_alarms, association, overlap
+
+
+def _numbered(ids: Sequence[IntArray]) -> tuple[int, list[IntArray]]:
+    """How many different ids there are, and the ids as numbers from 0."""
+    every = np.concatenate([np.zeros(0, np.int64), *ids])
+    names, index = np.unique(every, return_inverse=True)
+    return len(names), np.split(index, np.cumsum([len(own) for own in ids])[:-1]) if ids else []
+
+
+def track_scores(ids: Sequence[IntArray], scores: Sequence[FloatArray]) -> list[FloatArray]:
+    """For each frame the scores of the whole tracks of its outputs: the mean over the track's boxes."""
+    every = np.concatenate([np.zeros(0, np.int64), *ids])
+    _, index = np.unique(every, return_inverse=True)
+    values = np.concatenate([np.zeros(0), *scores])
+    mean = np.bincount(index, values) / np.maximum(np.bincount(index), 1)
+    return list(np.split(mean[index], np.cumsum([len(own) for own in ids])[:-1])) if ids else []

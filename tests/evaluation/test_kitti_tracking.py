@@ -1,0 +1,84 @@
+"""Tracks on KITTI's labels: what counts, what is excused, files that lie about."""
+
+import json
+
+import pytest
+from typer.testing import CliRunner
+
+from lcf3d.cli.app import app
+from lcf3d.errors import DatasetError, FormatError
+from lcf3d.evaluation.kitti_tracking import evaluate_tracks
+from lcf3d.formats.kitti_tracking import read_tracks
+
+
+def line(frame, track, name="Car", x=0.0, occluded=0, truncated=0, score=None, box="100 100 200 200"):
+    text = f"{frame} {track} {name} {truncated} {occluded} -1.5 {box} 1.5 1.6 4.0 {x} 1.6 20.0 0.0"
+    return text + ("" if score is None else f" {score}") + "\n"
+
+
+@pytest.fixture
+def world(tmp_path):
+    labels, results = tmp_path / "training" / "label_02", tmp_path / "out" / "tracks"
+    labels.mkdir(parents=True), results.mkdir(parents=True)
+
+    def write(truth, found):
+        (labels / "0000.txt").write_text("".join(truth))
+        (results / "0000.txt").write_text("".join(found))
+        return evaluate_tracks(labels, results, classes=["Car"])["Car"]
+
+    write.root, write.out = tmp_path, tmp_path / "out"
+    return write
+
+
+def test_labels_as_tracks_are_perfect(world):
+    metrics = world([line(t, 4) for t in range(5)], [line(t, 9, score=0.9) for t in range(5)])
+    assert metrics.averaged.best.mota == pytest.approx(100)
+    assert metrics.hota.hota == pytest.approx(100)
+    assert metrics.clear.objects == 5
+
+
+def test_what_does_not_count(world):
+    truth = [line(t, 4) for t in range(5)]
+    truth += [line(t, 5, "Van", x=10) for t in range(5)]
+    truth += [line(t, 6, x=-10, occluded=3) for t in range(5)]
+    truth += [line(t, 7, x=-20, truncated=1) for t in range(5)]
+    truth += [line(t, -1, "DontCare", x=-1000, box="300 100 400 200") for t in range(5)]
+    found = [line(t, 9, score=0.9) for t in range(5)]
+    found += [line(t, 10 + i, x=x, score=0.9) for t in range(5) for i, x in enumerate((10, -10, -20))]
+    found += [line(t, 20, x=30, score=0.9, box="310 110 390 190") for t in range(5)]
+    found += [line(t, 21, x=40, score=0.9, box="500 100 510 110") for t in range(5)]
+    metrics = world(truth, found)
+    assert (metrics.clear.objects, metrics.clear.hits, metrics.clear.false_alarms) == (5, 5, 0)
+    # and a plain false alarm is one
+    metrics = world(truth, [*found, line(0, 30, x=30, score=0.95)])
+    assert metrics.averaged.best.false_alarms == 1
+
+
+def test_overlap_below_a_quarter_is_none(world):
+    # cars of 4 m, 2.6 m apart: IoU 1.4 / 6.6
+    metrics = world([line(0, 4)], [line(0, 9, x=2.6, score=0.9)])
+    assert metrics.averaged.samota == 0
+
+
+def test_command(world):
+    world([line(t, 4) for t in range(5)], [line(t, 9, score=0.9) for t in range(5)])
+    run = CliRunner().invoke(app, ["eval", f"kitti:{world.root}", str(world.out), "--tracking", "--json"])
+    assert run.exit_code == 0, run.output
+    assert json.loads(run.output)["Car"]["MOTA"] == pytest.approx(100)
+    run = CliRunner().invoke(app, ["eval", f"kitti:{world.root / 'none'}", str(world.out), "--tracking"])
+    assert isinstance(run.exception, DatasetError)
+
+
+def test_bad_files(world, tmp_path):
+    bad = tmp_path / "bad.txt"
+    for text, message in (
+        ("0 1 Car 0 0\n", "18 columns"),
+        (line(0, 1, score="x"), "must be numbers"),
+        (line(0.5, 1, score=1), "whole numbers"),
+        (line(0, 1, score=1) * 2, "holds track 1 twice"),
+    ):
+        bad.write_text(text)
+        with pytest.raises(FormatError, match=message):
+            read_tracks(bad, results=True)
+    with pytest.raises(DatasetError, match="not a folder"):
+        evaluate_tracks(tmp_path / "nowhere", tmp_path)
