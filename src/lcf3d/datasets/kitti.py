@@ -19,7 +19,9 @@ from lcf3d.datasets.base import BaseDataset, CameraSource, LidarSource, ResultWr
 from lcf3d.datasets.check import Finding
 from lcf3d.datasets.images import ImageFiles, image_size
 from lcf3d.errors import DatasetError, FormatError
+from lcf3d.files import read_text
 from lcf3d.formats.kitti import detections_3d, read_frame_ids, read_objects
+from lcf3d.formats.scans import read_scan, unit_intensity
 from lcf3d.structures import KITTI_CLASSES, Camera, Detections3D, FloatArray, Frame
 
 # (camera name, image folder, projection in the calibration file)
@@ -86,11 +88,9 @@ def read_entries(path: Path, skip: Sequence[str] = ()) -> dict[str, FloatArray]:
         FormatError: a line is malformed; names it.
     """
     try:
-        text = path.read_text(encoding="utf-8")
-    except FileNotFoundError:
+        text = read_text(path)
+    except DatasetError:
         raise DatasetError(f"calibration file {path} does not exist") from None
-    except UnicodeDecodeError:
-        raise FormatError(f"{path} is not a text file in UTF-8") from None
     entries: dict[str, FloatArray] = {}
     for number, line in enumerate(text.splitlines(), 1):
         name, *fields = line.replace(":", " ").split() or [""]
@@ -122,23 +122,17 @@ def matrix_entry(
 
 
 def read_points(path: Path) -> NDArray[np.float32]:
-    """(N, 4) float32 ``x, y, z, reflectance`` of a ``.bin`` scan.
+    """(N, 4) float32 ``x, y, z, reflectance`` (0 to 1) of a ``.bin`` or ``.npy`` scan, see `lcf3d.formats.scans`.
 
     Raises:
         DatasetError: the file does not exist.
-        FormatError: it is cut off, or holds NaN or infinite values.
+        FormatError: it is cut off or no scan, or holds NaN or infinite values.
     """
-    try:
-        raw = path.read_bytes()
-    except FileNotFoundError:
-        raise DatasetError(f"scan {path} does not exist") from None
-    if len(raw) % 16:
-        raise FormatError(f"{path} is cut off: {len(raw)} bytes are no whole number of 16-byte points; copy it again")
-    points = np.frombuffer(raw, dtype="<f4").reshape(-1, 4).astype(np.float32)
+    points = np.ascontiguousarray(read_scan(path)[:, :4])
     bad = int((~np.isfinite(points).all(axis=1)).sum())
     if bad:
         raise FormatError(f"{path} holds {bad} points with NaN or infinite values; remove them first")
-    return points
+    return unit_intensity(points, path)
 
 
 def _check_image_size(path: Path, size: tuple[int, int], projection: FloatArray) -> None:

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lcf3d.errors import DatasetError, FormatError, ShapeError
-from lcf3d.files import write_text
+from lcf3d.files import read_text, write_text
 from lcf3d.formats.kitti_text import (
     LABEL_COLUMNS,
     NO_LOCATION,
@@ -25,7 +25,6 @@ from lcf3d.formats.kitti_text import (
     RESULT_COLUMNS,
     has_box3d,
     parse_files,
-    read_text,
 )
 from lcf3d.geometry.boxes import kitti_from_lidar, lidar_from_kitti, observation_angle
 from lcf3d.structures import Detections2D, Detections3D, FloatArray, IntArray
