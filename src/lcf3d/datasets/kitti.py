@@ -19,7 +19,7 @@ from lcf3d.datasets.base import BaseDataset, CameraSource, LidarSource, ResultWr
 from lcf3d.datasets.check import Finding
 from lcf3d.datasets.images import ImageFiles, image_size
 from lcf3d.errors import DatasetError, FormatError
-from lcf3d.files import read_text
+from lcf3d.files import list_files, read_text
 from lcf3d.formats.kitti import detections_3d, read_frame_ids, read_objects
 from lcf3d.formats.scans import read_scan, unit_intensity
 from lcf3d.structures import KITTI_CLASSES, Camera, Detections3D, FloatArray, Frame
@@ -36,6 +36,8 @@ IMAGE_SIZES = {
 }
 DEFAULT_IMAGE_SIZE = (1242, 375)
 PARTS = ("training", "testing")
+SCANS = (".bin", ".npy")
+IMAGES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".ppm")
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,7 +181,7 @@ def cameras_of(
 def is_tracking(root: Path) -> bool:
     """Whether a folder has the layout of the tracking benchmark, which also begins with ``training``."""
     return any(
-        any(path.is_dir() for path in (root / part / folder).glob("*"))
+        any(path.is_dir() for path in list_files(root / part / folder))
         for part in PARTS
         for folder in ("image_02", "image_03", "velodyne")
     ) or any((root / part / "label_02").is_dir() and not (root / part / "label_2").is_dir() for part in PARTS)
@@ -275,12 +277,12 @@ class KittiDataset(KittiLikeDataset):
     def _split_path(self, split: str) -> Path:
         path = self.root / "ImageSets" / f"{split}.txt"
         if not path.is_file():
-            known = sorted(p.stem for p in path.parent.glob("*.txt"))
+            known = [p.stem for p in list_files(path.parent, ".txt")]
             raise DatasetError(f"{path} does not exist; the splits there are: {', '.join(known) or 'none'}")
         return path
 
     def _all_ids(self) -> tuple[str, ...]:
-        ids = tuple(sorted(p.stem for p in (self.folder / "calib").glob("*.txt")))
+        ids = tuple(p.stem for p in list_files(self.folder / "calib", ".txt"))
         if not ids:
             raise DatasetError(f"{self.folder / 'calib'} holds no calibration files")
         return ids
@@ -288,11 +290,8 @@ class KittiDataset(KittiLikeDataset):
     @cached_property
     def _present(self) -> dict[str, dict[str, Path]]:
         """Files by folder and frame id, listed once."""
-        folders = ("velodyne", "label_2", *(folder for _, folder, _ in CAMERAS))
-        return {
-            name: {p.stem: p for p in (self.folder / name).glob("*")} if (self.folder / name).is_dir() else {}
-            for name in folders
-        }
+        endings = {"velodyne": SCANS, "label_2": (".txt",), **{folder: IMAGES for _, folder, _ in CAMERAS}}
+        return {name: {p.stem: p for p in list_files(self.folder / name, *ends)} for name, ends in endings.items()}
 
     def require_complete(self, frame_ids: Sequence[str]) -> None:
         """See that every frame has a calibration file, before any work begins.
@@ -300,7 +299,7 @@ class KittiDataset(KittiLikeDataset):
         Raises:
             DatasetError: some have none; says how many and which first.
         """
-        present = {p.stem for p in (self.folder / "calib").glob("*.txt")}
+        present = {p.stem for p in list_files(self.folder / "calib", ".txt")}
         absent = [frame_id for frame_id in frame_ids if frame_id not in present]
         if absent:
             raise DatasetError(

@@ -26,6 +26,7 @@ from lcf3d.datasets.nuscenes_splits import scenes_of_split
 from lcf3d.datasets.nuscenes_tables import CAMERAS, MAX_CAMERA_DELAY_S, NuscenesTables
 from lcf3d.detectors.lidar.sweeps import accumulate_sweeps
 from lcf3d.errors import ConfigError, DatasetError
+from lcf3d.files import inside
 from lcf3d.formats.nuscenes import read_submission, write_submission
 from lcf3d.formats.nuscenes_boxes import (
     GlobalBoxes,
@@ -173,7 +174,7 @@ class NuscenesDataset(BaseDataset):
         """2D detections of a list by sample and camera (`lcf3d.formats.coco`)."""
         from lcf3d.datasets.nuscenes_results import NuscenesCameraResults
 
-        return NuscenesCameraResults(path, class_names)
+        return NuscenesCameraResults(path, class_names, self.camera_names, self.image_sizes())
 
     def writer(self, folder: Path) -> ResultWriter:
         """One submission of all samples."""
@@ -301,7 +302,7 @@ class NuscenesDataset(BaseDataset):
 
     def _path(self, data_row: int) -> Path:
         name: bytes = self.tables.sensor_data.filenames[data_row]
-        return self.root / name.decode()
+        return inside(self.root, name.decode())
 
     def _global_from_sensor(self, data_row: int) -> FloatArray:
         """(4, 4) global coordinates from raw sensor coordinates at the time of a recording."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, overload
 
@@ -314,6 +314,12 @@ def objects_from_detections_2d(detections: Detections2D) -> KittiObjects:
         np.full(n, NO_ANGLE),
         detections.scores,
     )
+
+
+def renamed(objects: KittiObjects, name: str, target: str) -> KittiObjects:
+    """The objects with class ``name`` called ``target``."""
+    names = objects.class_names.tolist()
+    return replace(objects, class_names=np.array([target if n == name else n for n in names], dtype=np.str_))
 
 
 def _labels(objects: KittiObjects, class_names: Sequence[str]) -> IntArray:

@@ -11,8 +11,8 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 from typing_extensions import Self
 
-from lcf3d.errors import ConfigError
-from lcf3d.files import write_text
+from lcf3d.errors import ConfigError, FormatError
+from lcf3d.files import read_text, reading, write_text
 from lcf3d.fusion.evidence import ROLE_EVIDENCE, Evidence
 from lcf3d.fusion.roles import ROLES, role_of
 from lcf3d.structures import ARGOVERSE_CLASSES, KITTI_CLASSES, NUSCENES_CLASSES, FloatArray
@@ -155,9 +155,10 @@ class FusionConfig(BaseModel):
         if not path.is_file():
             raise ConfigError(f"{str(name_or_path)!r} is neither a preset ({', '.join(PRESETS)}) nor a file")
         try:
-            values = yaml.safe_load(path.read_text(encoding="utf-8"))
-        except yaml.YAMLError as error:
-            raise ConfigError(f"{path} is not valid YAML: {str(error).splitlines()[0]}") from None
+            with reading(path, "YAML settings"):
+                values = yaml.safe_load(read_text(path))
+        except FormatError as error:
+            raise ConfigError(str(error)) from None
         if not isinstance(values, dict):
             raise ConfigError(f"{path} must hold settings as 'name: value' lines")
         return cls.of({**own, **values}, source=str(path))

@@ -15,7 +15,7 @@ from typing import Any
 
 from lcf3d.datasets.base import ResultWriter
 from lcf3d.errors import ConfigError
-from lcf3d.files import read_json, write_json
+from lcf3d.files import inside, list_files, read_json, write_json
 from lcf3d.fusion.config import FusionConfig
 from lcf3d.provenance import FusedDetections
 from lcf3d.structures import Frame
@@ -53,7 +53,7 @@ class RunFolder:
 
     def provenance_path(self, frame_id: str) -> Path:
         """The provenance file of a frame."""
-        return self.path / "provenance" / f"{frame_id}.json"
+        return inside(self.path / "provenance", frame_id, ".json")
 
     def request(self) -> dict[str, Any]:
         """What was run, as ``run.json`` has it.
@@ -105,7 +105,7 @@ class RunFolder:
 
     def frame_ids(self) -> list[str]:
         """Frames that are done, sorted."""
-        return sorted(path.stem for path in (self.path / "provenance").glob("[!.]*.json"))
+        return [path.stem for path in list_files(self.path / "provenance", ".json")]
 
     def is_done(self, frame_id: str) -> bool:
         """Whether the files of a frame are there."""

@@ -14,7 +14,7 @@ from lcf3d.detectors.base import Image
 from lcf3d.detectors.camera.onnx_images import instance_masks, prepare_image
 from lcf3d.detectors.camera.onnx_layouts import LAYOUTS, SIZES_INPUT, class_count, identify_layout
 from lcf3d.detectors.camera.tiling import merge_tiles, non_maximum_suppression, tile_spans
-from lcf3d.detectors.classes import COCO_CLASSES, read_class_names, to_classes
+from lcf3d.detectors.classes import COCO_CLASSES, read_class_names, reported_classes, to_classes
 from lcf3d.errors import ConfigError, DetectorError, ShapeError
 from lcf3d.networks.onnx import first_line, open_session
 from lcf3d.structures import KITTI_CLASSES, Detections2D
@@ -94,6 +94,11 @@ class OnnxDetector:
     def layout(self) -> str:
         """Name of the output layout in use."""
         return self._layout.name
+
+    @property
+    def reports(self) -> tuple[str, ...]:
+        """The target classes that the network can report."""
+        return reported_classes(self.own_class_names, self.class_names, self._mapping)
 
     def __call__(self, images: Sequence[Image]) -> list[Detections2D]:
         """Detections of each (H, W, 3) uint8 RGB image, by descending score, in the target classes."""
