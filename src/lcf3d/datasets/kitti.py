@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from lcf3d.datasets.base import BaseDataset, CameraSource, LidarSource, ResultWriter, require_folder
 from lcf3d.datasets.check import Finding
 from lcf3d.datasets.images import ImageFiles, image_size
-from lcf3d.errors import DatasetError, FormatError
-from lcf3d.files import list_files, read_text
+from lcf3d.errors import ConfigError, DatasetError, FormatError
+from lcf3d.files import list_files, read_text, shortened
 from lcf3d.formats.kitti import detections_3d, read_frame_ids, read_objects
 from lcf3d.formats.scans import read_scan, unit_intensity
 from lcf3d.structures import KITTI_CLASSES, Camera, Detections3D, FloatArray, Frame
@@ -35,6 +35,8 @@ IMAGE_SIZES = {
     718.856: (1241, 376),
 }
 DEFAULT_IMAGE_SIZE = (1242, 375)
+# how far from the middle, as a share of the image, the principal point of an unknown camera may be
+NEAR_MIDDLE = 0.1
 PARTS = ("training", "testing")
 SCANS = (".bin", ".npy")
 IMAGES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".ppm")
@@ -82,6 +84,10 @@ def read_calibration(path: Path) -> KittiCalibration:
     return KittiCalibration(projections, rectification @ reference_from_lidar, lidar_from_imu)
 
 
+# lines of raw drives that say when and how it was calibrated
+NOT_NUMBERS = ("calib_time", "corner_dist")
+
+
 def read_entries(path: Path, skip: Sequence[str] = ()) -> dict[str, FloatArray]:
     """The numbers of a calibration file by the name that begins each line, but for the names in ``skip``.
 
@@ -96,7 +102,7 @@ def read_entries(path: Path, skip: Sequence[str] = ()) -> dict[str, FloatArray]:
     entries: dict[str, FloatArray] = {}
     for number, line in enumerate(text.splitlines(), 1):
         name, *fields = line.replace(":", " ").split() or [""]
-        if name in skip:
+        if name in skip or name in NOT_NUMBERS:
             continue
         try:
             entries[name] = np.array([float(f) for f in fields])
@@ -147,11 +153,23 @@ def _check_image_size(path: Path, size: tuple[int, int], projection: FloatArray)
             )
 
 
+def _require_default_size(name: str, projection: FloatArray) -> None:
+    """Refuse to take a camera without images for one of KITTI's against the evidence of its principal point."""
+    shares = projection[:2, 2] / np.array(DEFAULT_IMAGE_SIZE)
+    if (np.abs(shares - 0.5) > NEAR_MIDDLE).any():
+        x, y = projection[:2, 2]
+        raise FormatError(
+            f"camera {name} has no image, and its calibration (principal point {x:.0f}, {y:.0f}) is none of a "
+            f"{DEFAULT_IMAGE_SIZE[0]} x {DEFAULT_IMAGE_SIZE[1]} image: say the size as "
+            "kitti:ROOT?image_size=WIDTHxHEIGHT, or add the images"
+        )
+
+
 def cameras_of(
     calibration: KittiCalibration,
     images: Mapping[str, Path],
     sizes: Mapping[str, tuple[int, int]],
-    default_size: tuple[int, int] = DEFAULT_IMAGE_SIZE,
+    default_size: tuple[int, int] | None = None,
 ) -> list[Camera]:
     """The colour cameras that a calibration describes.
 
@@ -159,10 +177,10 @@ def cameras_of(
         calibration: of the frame.
         images: image files by camera name, of which the size is taken.
         sizes: (width, height) by name of cameras without an image; KITTI's own are known.
-        default_size: of all others.
+        default_size: of all others; without it KITTI's usual one, if the principal point is near its middle.
 
     Raises:
-        FormatError: an image that its calibration does not fit.
+        FormatError: an image that its calibration does not fit, or a camera whose image size nothing tells.
     """
     cameras = []
     for name, _, key in CAMERAS:
@@ -173,9 +191,30 @@ def cameras_of(
             size = image_size(images[name])
             _check_image_size(images[name], size, matrix)
         else:
-            size = sizes.get(name) or IMAGE_SIZES.get(round(float(matrix[0, 0]), 4), default_size)
+            size = sizes.get(name) or IMAGE_SIZES.get(round(float(matrix[0, 0]), 4)) or default_size
+            if size is None:
+                _require_default_size(name, matrix)
+                size = DEFAULT_IMAGE_SIZE
         cameras.append(Camera(name, matrix, calibration.camera_from_lidar, *size))
     return cameras
+
+
+def parse_image_size(size: tuple[int, int] | str | None) -> tuple[int, int] | None:
+    """(width, height) of ``WIDTHxHEIGHT`` or such a pair.
+
+    Raises:
+        ConfigError: it is neither.
+    """
+    if size is None:
+        return None
+    parts = size.lower().split("x") if isinstance(size, str) else size
+    try:
+        width, height = (int(part) for part in parts)
+    except (TypeError, ValueError):
+        width = height = 0
+    if width < 1 or height < 1:
+        raise ConfigError(f"image_size must read WIDTHxHEIGHT, in pixels, got {shortened(size)!r}")
+    return width, height
 
 
 def is_tracking(root: Path) -> bool:
@@ -231,7 +270,8 @@ class KittiDataset(KittiLikeDataset):
         part: ``training`` or ``testing``; without it the one that holds the frames of the split (``testing`` for splits
             whose name begins with ``test``, where both do).
         class_names: classes of the ground truth that frames give.
-        image_size: (width, height) of frames whose images are not there and whose calibration is none of KITTI's own.
+        image_size: (width, height), or ``WIDTHxHEIGHT``, of frames whose images are not there and whose calibration is
+            none of KITTI's own.
 
     Raises:
         DatasetError: the folder or the split does not exist.
@@ -246,11 +286,11 @@ class KittiDataset(KittiLikeDataset):
         *,
         part: str | None = None,
         class_names: Sequence[str] = KITTI_CLASSES,
-        image_size: tuple[int, int] = DEFAULT_IMAGE_SIZE,
+        image_size: tuple[int, int] | str | None = None,
     ) -> None:
         self.root = require_folder(Path(root).expanduser())
         self.class_names = tuple(class_names)
-        self.default_image_size = image_size
+        self.default_image_size = parse_image_size(image_size)
         self.split = split
         self._listed = () if split is None else read_frame_ids(self._split_path(split))
         self.folder = self.root / (part or self._part_of(self._listed))
