@@ -124,7 +124,8 @@ def reading(place: object, what: str) -> Iterator[None]:
     """
     try:
         yield
-    except (Lcf3dError, OSError):
+    except (Lcf3dError, OSError, json.JSONDecodeError):
+        # JSON's own error knows the line, and becomes a sentence where the text is known
         raise
     except RecursionError:
         raise FormatError(f"{place} is not {what}: it is nested too deep") from None

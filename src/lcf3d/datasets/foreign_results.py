@@ -17,7 +17,7 @@ import numpy as np
 from lcf3d.detectors.classes import class_mapping, read_class_names, to_classes
 from lcf3d.detectors.joins import LeftOut
 from lcf3d.errors import ConfigError, DatasetError, FormatError, Lcf3dError
-from lcf3d.files import list_files, read_json
+from lcf3d.files import list_files, read_json, reading
 from lcf3d.formats.objects3d import from_mmdet3d, from_openpcdet
 from lcf3d.formats.pickles import read_arrays
 from lcf3d.geometry.boxes import transform_boxes
@@ -78,28 +78,29 @@ class ForeignLidarResults:
         names: set[str] = set()
         self.left_out = LeftOut(path)
         known = set(frame_ids)
-        for frame_id, record in records.items():
-            found = _convert(record, own, path, frame_id)
-            names |= {found.class_names[i] for i in np.unique(found.labels)}
-            if turn is not None:
-                velocities = found.velocities
-                found = Detections3D(
-                    transform_boxes(found.boxes, turn),
-                    found.scores,
-                    found.labels,
-                    found.class_names,
-                    None if velocities is None else velocities @ turn[:2, :2].T,
-                )
-            self._frames[frame_id] = to_classes(found, self.class_names)
-            if frame_id not in known:
-                self.left_out.frames[frame_id] += len(found)
-                continue
-            taken = class_mapping(found.class_names, self.class_names)
-            for label in found.labels.tolist():
-                name = found.class_names[label]
-                if name not in taken:
-                    self.left_out.classes[name] += 1
-            self.left_out.taken += len(self._frames[frame_id])
+        with reading(path, "detections"):
+            for frame_id, record in records.items():
+                found = _convert(record, own, path, frame_id)
+                names |= {found.class_names[i] for i in np.unique(found.labels)}
+                if turn is not None:
+                    velocities = found.velocities
+                    found = Detections3D(
+                        transform_boxes(found.boxes, turn),
+                        found.scores,
+                        found.labels,
+                        found.class_names,
+                        None if velocities is None else velocities @ turn[:2, :2].T,
+                    )
+                self._frames[frame_id] = to_classes(found, self.class_names)
+                if frame_id not in known:
+                    self.left_out.frames[frame_id] += len(found)
+                    continue
+                taken = class_mapping(found.class_names, self.class_names)
+                for label in found.labels.tolist():
+                    name = found.class_names[label]
+                    if name not in taken:
+                        self.left_out.classes[name] += 1
+                self.left_out.taken += len(self._frames[frame_id])
         if names and not any(len(found) for found in self._frames.values()):
             raise DatasetError(
                 f"{path} has detections of {', '.join(sorted(names))}, none of the classes {', '.join(class_names)}"
@@ -155,6 +156,11 @@ def _frame_of(record: Mapping[str, Any], known: set[str]) -> str | None:
 
 
 def _convert(record: Mapping[str, Any], classes: Sequence[str], path: Path, frame_id: str) -> Detections3D:
+    with np.errstate(invalid="raise", over="raise"), reading(f"{path}: frame {frame_id}", "detections"):
+        return _converted(record, classes, path, frame_id)
+
+
+def _converted(record: Mapping[str, Any], classes: Sequence[str], path: Path, frame_id: str) -> Detections3D:
     try:
         if "boxes_lidar" in record:
             return from_openpcdet(record)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from lcf3d.errors import DatasetError, FormatError
-from lcf3d.files import read_text, write_text
+from lcf3d.files import read_text, reading, write_text
 from lcf3d.formats.json_stream import JsonCursor
 from lcf3d.formats.nuscenes_boxes import NUSCENES_ATTRIBUTES, GlobalBoxes
 from lcf3d.structures import NUSCENES_CLASSES, BoolArray, FloatArray
@@ -53,16 +53,17 @@ def read_submission(path: Path, max_boxes: int = MAX_BOXES_PER_SAMPLE) -> tuple[
     meta: dict[str, Any] | None = None
     found = False
     try:
-        for key in cursor.members():
-            if key == "results":
-                found = True
-                for token in cursor.members():
-                    tokens.append(token)
-                    parts.append(_read_sample(path, token, cursor.value(), max_boxes))
-            elif key == "meta":
-                meta = cursor.value()
-            else:
-                cursor.value()
+        with reading(path, "a nuScenes submission"):
+            for key in cursor.members():
+                if key == "results":
+                    found = True
+                    for token in cursor.members():
+                        tokens.append(token)
+                        parts.append(_read_sample(path, token, cursor.value(), max_boxes))
+                elif key == "meta":
+                    meta = cursor.value()
+                else:
+                    cursor.value()
     except json.JSONDecodeError as error:
         raise FormatError(f"{path}:{error.lineno}:{error.colno}: not a nuScenes submission ({error.msg})") from None
     if not found:

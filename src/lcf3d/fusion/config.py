@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from typing_extensions import Self
 
 from lcf3d.errors import ConfigError, FormatError
-from lcf3d.files import read_text, reading, write_text
+from lcf3d.files import read_text, reading, shortened, write_text
 from lcf3d.fusion.evidence import ROLE_EVIDENCE, Evidence
 from lcf3d.fusion.roles import ROLES, role_of
 from lcf3d.structures import ARGOVERSE_CLASSES, KITTI_CLASSES, NUSCENES_CLASSES, FloatArray
@@ -170,8 +170,14 @@ class FusionConfig(BaseModel):
         Raises:
             ConfigError: an unknown name or a value that makes no sense; names the setting and ``source``.
         """
+        unknown = [name for name in values if name not in cls.model_fields]
+        if unknown:
+            raise ConfigError(f"{source}: there is no setting {shortened(unknown[0])!r}")
         try:
-            return cls(**values)
+            with reading(source, "settings"):
+                return cls.model_validate(values)
+        except FormatError as error:
+            raise ConfigError(str(error)) from None
         except ValidationError as error:
             first = error.errors()[0]
             name = ".".join(str(part) for part in first["loc"])

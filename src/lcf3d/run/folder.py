@@ -15,7 +15,7 @@ from typing import Any
 
 from lcf3d.datasets.base import ResultWriter
 from lcf3d.errors import ConfigError
-from lcf3d.files import inside, list_files, read_json, write_json
+from lcf3d.files import inside, list_files, read_json, reading, write_json
 from lcf3d.fusion.config import FusionConfig
 from lcf3d.provenance import FusedDetections
 from lcf3d.structures import Frame
@@ -66,7 +66,7 @@ class RunFolder:
         if not isinstance(content, dict):
             raise ConfigError(f"{self.path / 'run.json'} does not say what was run")
         version = content.get("format", 1)
-        if not isinstance(version, int) or version > FORMAT:
+        if not isinstance(version, int) or not 1 <= version <= FORMAT:
             raise ConfigError(
                 f"{self.path} is a run of format {version}, written by lcf3d {content.get('lcf3d', '?')}; this lcf3d "
                 f"reads formats up to {FORMAT}: upgrade it"
@@ -129,4 +129,6 @@ class RunFolder:
         Raises:
             FormatError: it is not there or not readable.
         """
-        return FusedDetections.from_json(read_json(self.provenance_path(frame_id)))
+        path = self.provenance_path(frame_id)
+        with reading(path, "the provenance of a frame"):
+            return FusedDetections.from_json(read_json(path))

@@ -1,4 +1,4 @@
-"""Exports whose shapes fit several layouts are told by their values, or refused with a sentence that names the matter."""
+"""Exports whose shapes fit several layouts are told by their values, or refused with a sentence that says why."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def test_two_classes_of_queries(tmp_path: Path, black: np.ndarray) -> None:
 
 def test_what_values_do_not_tell_is_refused(tmp_path: Path) -> None:
     path = constant_graph(tmp_path / "m.onnx", {"out": rows(CELLS, 6)}, INPUT, {"names": CAR})
-    with pytest.raises(DetectorError, match="layout=..."):
+    with pytest.raises(DetectorError, match=r"layout=\.\.\."):
         OnnxDetector(path)
 
 
