@@ -317,6 +317,9 @@ class FusedDetections:
                     raise FormatError(f"column {name} of a provenance refers to what is not there")
             if len(table) and (table.detection >= np.where(table.camera >= 0, counts[table.camera], 0)).any():
                 raise FormatError("column detection of a provenance refers to what is not there")
+        led = np.concatenate([self.lidar.output, self.camera.output])
+        if len(np.unique(led[led >= 0])) != len(self.detections):
+            raise FormatError("a provenance does not say what each output comes from")
         if len(self.camera) and (self.camera.camera < 0).any():
             raise FormatError("a row of a 2D detection names no camera")
 

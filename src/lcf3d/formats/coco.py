@@ -172,7 +172,7 @@ def read_coco_index(
     try:
         categories = {int(record["id"]): str(record["name"]) for record in index["categories"]}
         files = {record["id"]: str(record["file_name"]) for record in index["images"]}
-    except (KeyError, TypeError, ValueError):
+    except (KeyError, TypeError, ValueError, OverflowError):
         raise FormatError(
             f"{path} must hold 'categories' with id and name and 'images' with id and file_name"
         ) from None
