@@ -13,6 +13,7 @@ from typing import Any, Protocol
 from lcf3d.datasets.base import CameraSource, Dataset, LidarSource
 from lcf3d.errors import DatasetError
 from lcf3d.fusion.alignment import Alignment
+from lcf3d.processes import end_with_parent, workers
 from lcf3d.provenance import FusedDetections, Outcome, Reason
 from lcf3d.run.alignment import aligned_frame
 from lcf3d.run.folder import RunFolder
@@ -136,6 +137,7 @@ _worker: FrameRunner
 def _start_worker(runner: FrameRunner) -> None:
     global _worker
     _worker = runner
+    end_with_parent()
 
 
 def _work(frame_id: str) -> FrameSummary:
@@ -158,7 +160,8 @@ def run_frames(runner: FrameRunner, frame_ids: Sequence[str], jobs: int = 1) -> 
     chunk = max(1, min(16, len(frame_ids) // (4 * jobs)))
     with ProcessPoolExecutor(jobs, mp_context=context, initializer=_start_worker, initargs=(runner,)) as pool:
         try:
-            yield from pool.map(_work, frame_ids, chunksize=chunk)
+            with workers("fusing: the frames that are done are kept, go on with --resume and fewer --jobs"):
+                yield from pool.map(_work, frame_ids, chunksize=chunk)
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from lcf3d.errors import ConfigError, FormatError, MissingExtraError
 from lcf3d.files import atomic_path, read_json, reading, write_json
+from lcf3d.processes import end_with_parent, workers
 from lcf3d.structures import FloatArray, IntArray
 
 if TYPE_CHECKING:
@@ -137,7 +138,10 @@ def write_samples(
     if jobs == 1:
         _count(map(work, missing), progress)
         return paths
-    with ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn")) as pool:
+    with (
+        workers("making samples: those that are done are kept, go on with --resume and fewer --jobs"),
+        ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn"), initializer=end_with_parent) as pool,
+    ):
         futures = [pool.submit(work, index) for index in missing]
         try:
             _count((future.result() for future in as_they_end(futures)), progress)
