@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from lcf3d.errors import FormatError
 from lcf3d.structures import BoolArray, Detections2D, Detections3D, FloatArray, IntArray
 
 
@@ -359,17 +360,58 @@ class FusedDetections:
 
     @classmethod
     def from_json(cls, value: dict[str, Any]) -> FusedDetections:
-        """The inverse of `to_json`; instance masks are not kept."""
-        return cls(
+        """The inverse of `to_json`; instance masks are not kept.
+
+        Raises:
+            FormatError: a row refers to a detection or camera that is not there.
+        """
+        fused = cls(
             detections=Detections3D(**_detections_from_json(value["detections"])),
             lidar=Decisions.from_rows(value["lidar"]),
             camera=Decisions.from_rows(value["camera"]),
             lidar_inputs=Detections3D(**_detections_from_json(value["lidar_inputs"])),
             camera_inputs=tuple(Detections2D(**_detections_from_json(d)) for d in value["camera_inputs"]),
             camera_names=tuple(value["cameras"]),
-            notes=tuple(value["notes"]),
+            notes=tuple(str(note) for note in value["notes"]),
             tracks=TrackTable.from_json(value["tracks"]) if "tracks" in value else None,
         )
+        fused.require_consistent()
+        return fused
+
+    def require_consistent(self) -> None:
+        """See that every row refers to detections and cameras that are there.
+
+        Raises:
+            FormatError: one does not; names the column.
+        """
+        if len(self.camera_names) != len(self.camera_inputs):
+            raise FormatError(f"{len(self.camera_inputs)} lists of 2D detections of {len(self.camera_names)} cameras")
+        if len(self.lidar) != len(self.lidar_inputs) or len(self.camera) != sum(map(len, self.camera_inputs)):
+            raise FormatError("a provenance needs one row a detection")
+        counts = np.array([*map(len, self.camera_inputs), 0], dtype=np.int64)
+        for table in (self.lidar, self.camera):
+            limits = {
+                "lidar": len(self.lidar_inputs),
+                "camera": len(self.camera_names),
+                "output": len(self.detections),
+                "pair": len(self.camera),
+            }
+            for name, limit in limits.items():
+                column = getattr(table, name)
+                if len(column) and (column.min() < -1 or column.max() >= limit):
+                    raise FormatError(f"column {name} of a provenance refers to what is not there")
+            if len(table) and (table.detection >= np.where(table.camera >= 0, counts[table.camera], 0)).any():
+                raise FormatError("column detection of a provenance refers to what is not there")
+        led = np.concatenate([self.lidar.output, self.camera.output])
+        # predicted boxes come from earlier frames
+        tracks = self.tracks
+        if tracks is not None and len(tracks) != len(self.detections):
+            raise FormatError("a provenance needs one row of tracks an output")
+        predicted = np.flatnonzero(tracks.predicted) if tracks is not None else np.zeros(0, dtype=np.int64)
+        if len(np.unique(np.concatenate([led[led >= 0], predicted]))) != len(self.detections):
+            raise FormatError("a provenance does not say what each output comes from")
+        if len(self.camera) and (self.camera.camera < 0).any():
+            raise FormatError("a row of a 2D detection names no camera")
 
 
 def _detections_to_json(detections: Detections2D | Detections3D) -> dict[str, Any]:

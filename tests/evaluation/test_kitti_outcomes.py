@@ -10,7 +10,7 @@ from lcf3d.evaluation.kitti_outcomes import fusion_outcomes, read_provenance, wo
 from lcf3d.evaluation.kitti_study import study
 from lcf3d.geometry.boxes import lidar_from_kitti
 from lcf3d.provenance import Decisions, FusedDetections, Outcome, Reason
-from lcf3d.structures import Detections3D
+from lcf3d.structures import Detections2D, Detections3D
 
 from .kitti_frames import frames
 
@@ -41,7 +41,9 @@ def fusion() -> tuple[list[dict[str, object]], list[dict[str, object]], FusedDet
     table.output[:] = [0, -1, 1, -1, -1]
     camera = Decisions.blank(1)
     camera.outcome[:], camera.reason[:], camera.output[:] = Outcome.RECOVERED, Reason.LOCALIZED, 2
-    fused = FusedDetections(detections(output), table, camera, detections(lidar), (), ("left",))
+    camera.camera[:], camera.detection[:] = 0, 0
+    seen = Detections2D([[500, 0, 590, 50]], [0.6], [0], ("Car",))
+    fused = FusedDetections(detections(output), table, camera, detections(lidar), (seen,), ("left",))
     return truth, output, fused
 
 

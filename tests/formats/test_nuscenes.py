@@ -105,7 +105,7 @@ def test_repeated_tokens_and_other_files(tmp_path: Path) -> None:
         read_submission(path)
     with pytest.raises(FormatError, match="does not exist"):
         read_submission(tmp_path / "none.json")
-    with pytest.raises(FormatError, match="cannot be read"):
+    with pytest.raises(FormatError, match="is a folder"):
         read_submission(tmp_path)
 
 

@@ -104,7 +104,12 @@ def run(
     prepared.folder.finish(prepared.frame_ids)
     if pictures:
         _draw(prepared, quiet=json_)
-    counts = {**total(summaries), "already_done": len(prepared.frame_ids) - len(pending), "out": str(out)}
+    counts = {
+        **total(summaries),
+        "left_out": list(prepared.notes),
+        "already_done": len(prepared.frame_ids) - len(pending),
+        "out": str(out),
+    }
     if json_:
         typer.echo(json.dumps(counts, indent=2))
     else:
@@ -175,6 +180,8 @@ def _print(counts: dict[str, Any]) -> None:
     out.print(table)
     for reason, count in counts["dropped_lidar"].items():
         out.print(f"dropped LiDAR detections, {reason.replace('_', ' ')}: {count}")
+    for note in counts["left_out"]:
+        out.print(note, soft_wrap=True)
     for note, count in counts["notes"].items():
         out.print(f"in {count} frames: {note}", soft_wrap=True)
     if counts["median_ms"]:

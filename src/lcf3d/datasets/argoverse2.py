@@ -158,7 +158,7 @@ class Argoverse2Dataset(BaseDataset):
         """2D detections of a list by frame and camera (`lcf3d.formats.coco`)."""
         from lcf3d.datasets.nuscenes_results import NuscenesCameraResults
 
-        return NuscenesCameraResults(path, class_names)
+        return NuscenesCameraResults(path, class_names, self.camera_names, self.image_sizes())
 
     def writer(self, folder: Path) -> ResultWriter:
         """One file in the submission form."""

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from lcf3d.errors import DatasetError
+from lcf3d.files import list_files
 from lcf3d.formats.argoverse import Calibration, Cuboids, read_annotations, read_calibration, read_poses
 from lcf3d.formats.feather import read_columns
 from lcf3d.structures import Detections3D, FloatArray, IntArray
@@ -46,7 +47,7 @@ class Argoverse2Log:
     @cached_property
     def sweeps(self) -> dict[int, Path]:
         """Sweep files by time in nanoseconds."""
-        return _by_time((self.folder / "sensors/lidar").glob("*.feather"))
+        return _by_time(list_files(self.folder / "sensors/lidar", ".feather"))
 
     @cached_property
     def _poses(self) -> tuple[IntArray, FloatArray]:
@@ -56,8 +57,8 @@ class Argoverse2Log:
     def _images(self) -> dict[str, tuple[IntArray, list[Path]]]:
         """Times, ascending, and files of each camera's images."""
         found = {}
-        for folder in sorted((self.folder / "sensors/cameras").glob("*")):
-            paths = _by_time(folder.glob("*.jpg"))
+        for folder in list_files(self.folder / "sensors/cameras"):
+            paths = _by_time(list_files(folder, ".jpg"))
             found[folder.name] = np.array(sorted(paths), dtype=np.int64), [paths[time] for time in sorted(paths)]
         return found
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from lcf3d.datasets.argoverse2_frames import detections_by_frame, id_of, results_of_frames, split_id
+from lcf3d.detectors.joins import LeftOut, join_classes
 from lcf3d.errors import DatasetError
 from lcf3d.formats.argoverse import read_submission, write_submission
 from lcf3d.provenance import FusedDetections
@@ -45,6 +47,18 @@ class ArgoverseLidarResults:
                 f"{path} holds boxes of {len(self._frames)} sweeps, but of none of the {len(frame_ids)} frames; "
                 f"the first there is {first}, the first frame {frame_ids[0]}"
             )
+        self.left_out = LeftOut(path)
+        known = set(frame_ids)
+        for frame_id, one in self._frames.items():
+            joined = join_classes(one.class_names, self.class_names)
+            for label, count in Counter(one.labels.tolist()).items():
+                name = one.class_names[label]
+                if frame_id not in known:
+                    self.left_out.frames[frame_id] += count
+                elif name in joined:
+                    self.left_out.taken += count
+                else:
+                    self.left_out.classes[name] += count
         logs = list(dict.fromkeys(split_id(id)[0] for id in frame_ids))
         absent = [log for log in logs if log not in found.log_ids]
         if absent and missing == "error":
@@ -56,7 +70,11 @@ class ArgoverseLidarResults:
     def detect(self, frame: Frame) -> Detections3D:
         """The detections of one frame in its LiDAR frame."""
         found = self._frames.get(frame.id)
-        return self._empty if found is None else found.with_classes(self.class_names)
+        return (
+            self._empty
+            if found is None
+            else found.with_classes(self.class_names, join_classes(found.class_names, self.class_names))
+        )
 
 
 class ArgoverseWriter:

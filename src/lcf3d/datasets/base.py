@@ -156,6 +156,11 @@ class BaseDataset(Sequence[Frame]):
         """Whether the frame offers an image of that camera."""
         return camera in self.frame(frame_id).images
 
+    def image_sizes(self) -> dict[str, tuple[int, int]]:
+        """(width, height) by camera of the first frame."""
+        cameras = self.frame(self.ids[0]).cameras if self.ids else ()
+        return {camera.name: (camera.width, camera.height) for camera in cameras}
+
     def lidar_results(self, path: Path, class_names: Sequence[str], missing: str = "error") -> LidarSource:
         """3D detections in JSON files of our own."""
         from lcf3d.datasets.plain_results import PlainLidarResults
@@ -166,7 +171,7 @@ class BaseDataset(Sequence[Frame]):
         """2D detections in JSON files of our own."""
         from lcf3d.datasets.plain_results import PlainCameraResults
 
-        return PlainCameraResults(path, class_names, missing)
+        return PlainCameraResults(path, class_names, missing, self.camera_names)
 
     def writer(self, folder: Path) -> ResultWriter:
         """One JSON file a frame."""

@@ -14,9 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from lcf3d.detectors.classes import read_class_names, to_classes
+from lcf3d.detectors.classes import class_mapping, read_class_names, to_classes
+from lcf3d.detectors.joins import LeftOut
 from lcf3d.errors import ConfigError, DatasetError, FormatError, Lcf3dError
-from lcf3d.files import read_json
+from lcf3d.files import list_files, read_json, reading
 from lcf3d.formats.objects3d import from_mmdet3d, from_openpcdet
 from lcf3d.formats.pickles import read_arrays
 from lcf3d.geometry.boxes import transform_boxes
@@ -30,7 +31,7 @@ def is_foreign(path: Path) -> bool:
     if path.suffix in (".pkl", ".pickle"):
         return True
     if path.is_dir():
-        first = next(iter(sorted(path.glob("*.json"))), None)
+        first = next(iter(list_files(path, ".json")), None)
         return first is not None and _has_boxes(first)
     return path.suffix == ".json" and path.is_file() and _has_boxes(path)
 
@@ -75,19 +76,31 @@ class ForeignLidarResults:
             turn = np.asarray(np.linalg.inv(native_from_canonical), dtype=np.float64)
         self._frames: dict[str, Detections3D] = {}
         names: set[str] = set()
-        for frame_id, record in records.items():
-            found = _convert(record, own, path, frame_id)
-            names |= {found.class_names[i] for i in np.unique(found.labels)}
-            if turn is not None:
-                velocities = found.velocities
-                found = Detections3D(
-                    transform_boxes(found.boxes, turn),
-                    found.scores,
-                    found.labels,
-                    found.class_names,
-                    None if velocities is None else velocities @ turn[:2, :2].T,
-                )
-            self._frames[frame_id] = to_classes(found, self.class_names)
+        self.left_out = LeftOut(path)
+        known = set(frame_ids)
+        with reading(path, "detections"):
+            for frame_id, record in records.items():
+                found = _convert(record, own, path, frame_id)
+                names |= {found.class_names[i] for i in np.unique(found.labels)}
+                if turn is not None:
+                    velocities = found.velocities
+                    found = Detections3D(
+                        transform_boxes(found.boxes, turn),
+                        found.scores,
+                        found.labels,
+                        found.class_names,
+                        None if velocities is None else velocities @ turn[:2, :2].T,
+                    )
+                self._frames[frame_id] = to_classes(found, self.class_names)
+                if frame_id not in known:
+                    self.left_out.frames[frame_id] += len(found)
+                    continue
+                taken = class_mapping(found.class_names, self.class_names)
+                for label in found.labels.tolist():
+                    name = found.class_names[label]
+                    if name not in taken:
+                        self.left_out.classes[name] += 1
+                self.left_out.taken += len(self._frames[frame_id])
         if names and not any(len(found) for found in self._frames.values()):
             raise DatasetError(
                 f"{path} has detections of {', '.join(sorted(names))}, none of the classes {', '.join(class_names)}"
@@ -116,7 +129,7 @@ class ForeignLidarResults:
 def _read_records(path: Path, known: set[str]) -> dict[str, Mapping[str, Any]]:
     """Record by frame."""
     if path.is_dir():
-        return {file.stem: read_json(file) for file in sorted(path.glob("*.json"))}
+        return {file.stem: read_json(file) for file in list_files(path, ".json")}
     content = read_json(path) if path.suffix == ".json" else read_arrays(path)
     if isinstance(content, Mapping) and "bboxes_3d" in content:
         return {path.stem: content}
@@ -143,6 +156,11 @@ def _frame_of(record: Mapping[str, Any], known: set[str]) -> str | None:
 
 
 def _convert(record: Mapping[str, Any], classes: Sequence[str], path: Path, frame_id: str) -> Detections3D:
+    with np.errstate(invalid="raise", over="raise"), reading(f"{path}: frame {frame_id}", "detections"):
+        return _converted(record, classes, path, frame_id)
+
+
+def _converted(record: Mapping[str, Any], classes: Sequence[str], path: Path, frame_id: str) -> Detections3D:
     try:
         if "boxes_lidar" in record:
             return from_openpcdet(record)

@@ -19,9 +19,11 @@ from lcf3d.datasets.base import BaseDataset, CameraSource, LidarSource, ResultWr
 from lcf3d.datasets.check import Finding
 from lcf3d.datasets.images import ImageFiles, image_size
 from lcf3d.datasets.kitti_sequences import FRAMES_PER_S, lidar_pose, sequence_of
-from lcf3d.errors import DatasetError, FormatError
+from lcf3d.errors import ConfigError, DatasetError, FormatError
+from lcf3d.files import list_files, read_text, shortened
 from lcf3d.formats.kitti import detections_3d, read_frame_ids, read_objects
 from lcf3d.formats.kitti_drives import read_camera_poses
+from lcf3d.formats.scans import read_scan, unit_intensity
 from lcf3d.structures import KITTI_CLASSES, Camera, Detections3D, FloatArray, Frame
 
 # (camera name, image folder, projection in the calibration file)
@@ -35,7 +37,11 @@ IMAGE_SIZES = {
     718.856: (1241, 376),
 }
 DEFAULT_IMAGE_SIZE = (1242, 375)
+# how far from the middle, as a share of the image, the principal point of an unknown camera may be
+NEAR_MIDDLE = 0.1
 PARTS = ("training", "testing")
+SCANS = (".bin", ".npy")
+IMAGES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".ppm")
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,6 +86,10 @@ def read_calibration(path: Path) -> KittiCalibration:
     return KittiCalibration(projections, rectification @ reference_from_lidar, lidar_from_imu)
 
 
+# lines of raw drives that say when and how it was calibrated
+NOT_NUMBERS = ("calib_time", "corner_dist")
+
+
 def read_entries(path: Path, skip: Sequence[str] = ()) -> dict[str, FloatArray]:
     """The numbers of a calibration file by the name that begins each line, but for the names in ``skip``.
 
@@ -88,15 +98,13 @@ def read_entries(path: Path, skip: Sequence[str] = ()) -> dict[str, FloatArray]:
         FormatError: a line is malformed; names it.
     """
     try:
-        text = path.read_text(encoding="utf-8")
-    except FileNotFoundError:
+        text = read_text(path)
+    except DatasetError:
         raise DatasetError(f"calibration file {path} does not exist") from None
-    except UnicodeDecodeError:
-        raise FormatError(f"{path} is not a text file in UTF-8") from None
     entries: dict[str, FloatArray] = {}
     for number, line in enumerate(text.splitlines(), 1):
         name, *fields = line.replace(":", " ").split() or [""]
-        if name in skip:
+        if name in skip or name in NOT_NUMBERS:
             continue
         try:
             entries[name] = np.array([float(f) for f in fields])
@@ -124,23 +132,17 @@ def matrix_entry(
 
 
 def read_points(path: Path) -> NDArray[np.float32]:
-    """(N, 4) float32 ``x, y, z, reflectance`` of a ``.bin`` scan.
+    """(N, 4) float32 ``x, y, z, reflectance`` (0 to 1) of a ``.bin`` or ``.npy`` scan, see `lcf3d.formats.scans`.
 
     Raises:
         DatasetError: the file does not exist.
-        FormatError: it is cut off, or holds NaN or infinite values.
+        FormatError: it is cut off or no scan, or holds NaN or infinite values.
     """
-    try:
-        raw = path.read_bytes()
-    except FileNotFoundError:
-        raise DatasetError(f"scan {path} does not exist") from None
-    if len(raw) % 16:
-        raise FormatError(f"{path} is cut off: {len(raw)} bytes are no whole number of 16-byte points; copy it again")
-    points = np.frombuffer(raw, dtype="<f4").reshape(-1, 4).astype(np.float32)
+    points = np.ascontiguousarray(read_scan(path)[:, :4])
     bad = int((~np.isfinite(points).all(axis=1)).sum())
     if bad:
         raise FormatError(f"{path} holds {bad} points with NaN or infinite values; remove them first")
-    return points
+    return unit_intensity(points, path)
 
 
 def _check_image_size(path: Path, size: tuple[int, int], projection: FloatArray) -> None:
@@ -153,11 +155,23 @@ def _check_image_size(path: Path, size: tuple[int, int], projection: FloatArray)
             )
 
 
+def _require_default_size(name: str, projection: FloatArray) -> None:
+    """Refuse to take a camera without images for one of KITTI's against the evidence of its principal point."""
+    shares = projection[:2, 2] / np.array(DEFAULT_IMAGE_SIZE)
+    if (np.abs(shares - 0.5) > NEAR_MIDDLE).any():
+        x, y = projection[:2, 2]
+        raise FormatError(
+            f"camera {name} has no image, and its calibration (principal point {x:.0f}, {y:.0f}) is none of a "
+            f"{DEFAULT_IMAGE_SIZE[0]} x {DEFAULT_IMAGE_SIZE[1]} image: say the size as "
+            "kitti:ROOT?image_size=WIDTHxHEIGHT, or add the images"
+        )
+
+
 def cameras_of(
     calibration: KittiCalibration,
     images: Mapping[str, Path],
     sizes: Mapping[str, tuple[int, int]],
-    default_size: tuple[int, int] = DEFAULT_IMAGE_SIZE,
+    default_size: tuple[int, int] | None = None,
 ) -> list[Camera]:
     """The colour cameras that a calibration describes.
 
@@ -165,10 +179,10 @@ def cameras_of(
         calibration: of the frame.
         images: image files by camera name, of which the size is taken.
         sizes: (width, height) by name of cameras without an image; KITTI's own are known.
-        default_size: of all others.
+        default_size: of all others; without it KITTI's usual one, if the principal point is near its middle.
 
     Raises:
-        FormatError: an image that its calibration does not fit.
+        FormatError: an image that its calibration does not fit, or a camera whose image size nothing tells.
     """
     cameras = []
     for name, _, key in CAMERAS:
@@ -179,15 +193,36 @@ def cameras_of(
             size = image_size(images[name])
             _check_image_size(images[name], size, matrix)
         else:
-            size = sizes.get(name) or IMAGE_SIZES.get(round(float(matrix[0, 0]), 4), default_size)
+            known = sizes.get(name) or IMAGE_SIZES.get(round(float(matrix[0, 0]), 4)) or default_size
+            if known is None:
+                _require_default_size(name, matrix)
+            size = known or DEFAULT_IMAGE_SIZE
         cameras.append(Camera(name, matrix, calibration.camera_from_lidar, *size))
     return cameras
+
+
+def parse_image_size(size: tuple[int, int] | str | None) -> tuple[int, int] | None:
+    """(width, height) of ``WIDTHxHEIGHT`` or such a pair.
+
+    Raises:
+        ConfigError: it is neither.
+    """
+    if size is None:
+        return None
+    parts = size.lower().split("x") if isinstance(size, str) else size
+    try:
+        width, height = (int(part) for part in parts)
+    except (TypeError, ValueError):
+        width = height = 0
+    if width < 1 or height < 1:
+        raise ConfigError(f"image_size must read WIDTHxHEIGHT, in pixels, got {shortened(size)!r}")
+    return width, height
 
 
 def is_tracking(root: Path) -> bool:
     """Whether a folder has the layout of the tracking benchmark, which also begins with ``training``."""
     return any(
-        any(path.is_dir() for path in (root / part / folder).glob("*"))
+        any(path.is_dir() for path in list_files(root / part / folder))
         for part in PARTS
         for folder in ("image_02", "image_03", "velodyne")
     ) or any((root / part / "label_02").is_dir() and not (root / part / "label_2").is_dir() for part in PARTS)
@@ -237,7 +272,8 @@ class KittiDataset(KittiLikeDataset):
         part: ``training`` or ``testing``; without it the one that holds the frames of the split (``testing`` for splits
             whose name begins with ``test``, where both do).
         class_names: classes of the ground truth that frames give.
-        image_size: (width, height) of frames whose images are not there and whose calibration is none of KITTI's own.
+        image_size: (width, height), or ``WIDTHxHEIGHT``, of frames whose images are not there and whose calibration is
+            none of KITTI's own.
 
     Raises:
         DatasetError: the folder or the split does not exist.
@@ -252,11 +288,11 @@ class KittiDataset(KittiLikeDataset):
         *,
         part: str | None = None,
         class_names: Sequence[str] = KITTI_CLASSES,
-        image_size: tuple[int, int] = DEFAULT_IMAGE_SIZE,
+        image_size: tuple[int, int] | str | None = None,
     ) -> None:
         self.root = require_folder(Path(root).expanduser())
         self.class_names = tuple(class_names)
-        self.default_image_size = image_size
+        self.default_image_size = parse_image_size(image_size)
         self.split = split
         self._poses_read: dict[str, FloatArray | None] = {}
         self._listed = () if split is None else read_frame_ids(self._split_path(split))
@@ -284,12 +320,12 @@ class KittiDataset(KittiLikeDataset):
     def _split_path(self, split: str) -> Path:
         path = self.root / "ImageSets" / f"{split}.txt"
         if not path.is_file():
-            known = sorted(p.stem for p in path.parent.glob("*.txt"))
+            known = [p.stem for p in list_files(path.parent, ".txt")]
             raise DatasetError(f"{path} does not exist; the splits there are: {', '.join(known) or 'none'}")
         return path
 
     def _all_ids(self) -> tuple[str, ...]:
-        ids = tuple(sorted(p.stem for p in (self.folder / "calib").glob("*.txt")))
+        ids = tuple(p.stem for p in list_files(self.folder / "calib", ".txt"))
         if not ids:
             raise DatasetError(f"{self.folder / 'calib'} holds no calibration files")
         return ids
@@ -297,11 +333,8 @@ class KittiDataset(KittiLikeDataset):
     @cached_property
     def _present(self) -> dict[str, dict[str, Path]]:
         """Files by folder and frame id, listed once."""
-        folders = ("velodyne", "label_2", *(folder for _, folder, _ in CAMERAS))
-        return {
-            name: {p.stem: p for p in (self.folder / name).glob("*")} if (self.folder / name).is_dir() else {}
-            for name in folders
-        }
+        endings = {"velodyne": SCANS, "label_2": (".txt",), **{folder: IMAGES for _, folder, _ in CAMERAS}}
+        return {name: {p.stem: p for p in list_files(self.folder / name, *ends)} for name, ends in endings.items()}
 
     def require_complete(self, frame_ids: Sequence[str]) -> None:
         """See that every frame has a calibration file, before any work begins.
@@ -309,7 +342,7 @@ class KittiDataset(KittiLikeDataset):
         Raises:
             DatasetError: some have none; says how many and which first.
         """
-        present = {p.stem for p in (self.folder / "calib").glob("*.txt")}
+        present = {p.stem for p in list_files(self.folder / "calib", ".txt")}
         absent = [frame_id for frame_id in frame_ids if frame_id not in present]
         if absent:
             raise DatasetError(

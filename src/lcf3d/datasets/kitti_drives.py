@@ -15,6 +15,7 @@ import numpy as np
 
 from lcf3d.datasets.kitti import KittiCalibration, matrix_entry, read_calibration, read_entries
 from lcf3d.errors import DatasetError
+from lcf3d.files import list_files
 from lcf3d.formats.kitti import KittiObjects, detections_3d
 from lcf3d.formats.kitti_drives import (
     TrackedObjects,
@@ -63,12 +64,12 @@ class Drive:
     @cached_property
     def scans(self) -> dict[int, Path]:
         """Scan files by frame number."""
-        return _by_number(self.scan_folder.glob("*.bin"))
+        return _by_number(list_files(self.scan_folder, ".bin", ".npy"))
 
     @cached_property
     def images(self) -> dict[str, dict[int, Path]]:
         """Image files by camera name and frame number."""
-        return {name: _by_number(folder.glob("*.*")) for name, folder in self.image_folders.items()}
+        return {name: _by_number(list_files(folder)) for name, folder in self.image_folders.items()}
 
     @cached_property
     def numbers(self) -> tuple[int, ...]:
@@ -183,7 +184,7 @@ class RawDrive(Drive):
 
     @cached_property
     def _poses(self) -> dict[int, FloatArray]:
-        paths = _by_number((self.folder / "oxts/data").glob("*.txt"))
+        paths = _by_number(list_files(self.folder / "oxts/data", ".txt"))
         if not paths or self.calibration.lidar_from_imu is None:
             return {}
         records = np.concatenate([read_oxts(paths[number])[:1] for number in sorted(paths)])
@@ -316,7 +317,7 @@ def raw_drives(root: Path) -> list[Drive]:
 
 def tracking_drives(part: Path) -> list[Drive]:
     """Sequences of the tracking benchmark's folder ``training`` or ``testing``: those with a calibration."""
-    return [TrackingDrive(part, path.stem) for path in sorted((part / "calib").glob("*.txt"))]
+    return [TrackingDrive(part, path.stem) for path in list_files(part / "calib", ".txt")]
 
 
 def odometry_drives(root: Path) -> list[Drive]:

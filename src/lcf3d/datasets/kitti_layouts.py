@@ -13,6 +13,7 @@ from lcf3d.datasets.kitti import PARTS, KittiCalibration, KittiLikeDataset, came
 from lcf3d.datasets.kitti_check import check_results
 from lcf3d.datasets.kitti_drives import Drive, odometry_drives, raw_drives, tracking_drives
 from lcf3d.errors import ConfigError, DatasetError
+from lcf3d.files import list_files
 from lcf3d.formats.kitti import read_frame_ids
 from lcf3d.structures import KITTI_CLASSES, Frame
 
@@ -65,7 +66,7 @@ class KittiSequences(KittiLikeDataset):
     def _split_path(self, split: str) -> Path:
         path = self.root / "ImageSets" / f"{split}.txt"
         if not path.is_file():
-            known = ", ".join(sorted(p.stem for p in path.parent.glob("*.txt"))) or "none"
+            known = ", ".join(p.stem for p in list_files(path.parent, ".txt")) or "none"
             raise DatasetError(f"{path} does not exist; the splits there are: {known}")
         return path
 

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
 from lcf3d.datasets.kitti_sequences import sequence_of
+from lcf3d.detectors.joins import LeftOut, join_classes, require_pixels
 from lcf3d.errors import ConfigError, DatasetError
+from lcf3d.files import inside, list_files
 from lcf3d.formats.kitti import (
     KittiObjects,
     detections_2d,
@@ -17,6 +21,7 @@ from lcf3d.formats.kitti import (
     objects_from_detections,
     read_folder,
     read_objects,
+    renamed,
     write_objects,
 )
 from lcf3d.formats.kitti_tracking import write_tracks
@@ -40,16 +45,40 @@ class KittiResults:
         self.class_names = tuple(class_names)
         self.missing: Literal["error", "empty"] = "empty" if missing == "empty" else "error"
         self._frames: dict[str, KittiObjects] = {}
+        self.left_out = LeftOut(self.folder)
 
     def load(self, frame_ids: Sequence[str]) -> None:
         """Read the files of these frames.
 
         Raises:
-            DatasetError: the folder misses some of them; says how many and which first.
+            DatasetError: the folder misses some of them; says how many and which first. Or all of its detections are of
+                other classes.
             FormatError: a line is malformed; names file and line.
         """
         frames = read_folder(self.folder, frame_ids, results=True, missing=self.missing)
-        self._frames = dict(zip(frame_ids, frames, strict=True))
+        names = sorted(set(frames.objects.class_names.tolist()))
+        joined = join_classes(names, self.class_names)
+        for name, target in joined.items():
+            if name != target:
+                frames = replace(frames, objects=renamed(frames.objects, name, target))
+        self._frames.update(zip(frame_ids, frames, strict=True))
+        if len(frame_ids) > 1 or not self.left_out.taken:
+            self._count(frames.objects)
+
+    def _count(self, objects: KittiObjects) -> None:
+        """Note what of the objects is taken, and what is not.
+
+        Raises:
+            DatasetError: none of them is of a class of the run.
+        """
+        self.left_out = LeftOut(self.folder)
+        for name, count in Counter(objects.class_names.tolist()).items():
+            if name in self.class_names:
+                self.left_out.taken += count
+                self.left_out.seen.add(name)
+            elif name != "DontCare":
+                self.left_out.classes[name] += count
+        self.left_out.require_some(self.class_names)
 
     def require_probabilities(self, calibrated: Collection[str]) -> None:
         """See that the scores that `load` has read lie in [0, 1], but for those of classes that are ``calibrated``.
@@ -96,6 +125,17 @@ class KittiLidarResults(KittiResults):
 class KittiCameraResults(KittiResults):
     """2D detections of a camera detector."""
 
+    def load(self, frame_ids: Sequence[str]) -> None:
+        """Read the files of these frames, see `KittiResults.load`.
+
+        Raises:
+            FormatError: also where the boxes are no pixels.
+        """
+        super().load(frame_ids)
+        boxes = [self._frames[frame_id].boxes2d for frame_id in frame_ids]
+        if len(boxes) > 1 or len(self._frames) == 1:
+            require_pixels(np.concatenate(boxes), self.folder)
+
     def sees(self, frame: Frame, camera: str) -> bool:
         """Always: a frame without detections was looked at."""
         return True
@@ -122,7 +162,7 @@ class KittiWriter:
         """Write the result file of a frame."""
         camera_from_lidar = frame.cameras[0].camera_from_lidar
         objects = objects_from_detections(fused.detections, image_boxes(frame, fused), camera_from_lidar)
-        write_objects(self.folder / f"{frame.id}.txt", objects)
+        write_objects(inside(self.folder, frame.id, ".txt"), objects)
 
     def is_done(self, frame_id: str) -> bool:
         """Whether the file of a frame is there."""
@@ -145,8 +185,8 @@ class KittiWriter:
 
     def written(self) -> Iterator[Path]:
         """The files of all frames, and the tracks."""
-        yield from sorted(self.folder.glob("[!.]*.txt"))
-        yield from sorted(self.tracks.glob("[!.]*.txt"))
+        yield from list_files(self.folder, ".txt")
+        yield from list_files(self.tracks, ".txt")
 
 
 def image_boxes(frame: Frame, fused: FusedDetections) -> FloatArray:

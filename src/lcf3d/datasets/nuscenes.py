@@ -25,7 +25,8 @@ from lcf3d.datasets.nuscenes_loading import find_version, load_tables
 from lcf3d.datasets.nuscenes_splits import scenes_of_split
 from lcf3d.datasets.nuscenes_tables import CAMERAS, MAX_CAMERA_DELAY_S, NuscenesTables
 from lcf3d.detectors.lidar.sweeps import accumulate_sweeps
-from lcf3d.errors import ConfigError, DatasetError, FormatError
+from lcf3d.errors import ConfigError, DatasetError
+from lcf3d.files import inside
 from lcf3d.formats.nuscenes import read_submission, write_submission
 from lcf3d.formats.nuscenes_boxes import (
     GlobalBoxes,
@@ -34,6 +35,7 @@ from lcf3d.formats.nuscenes_boxes import (
     split_by_sample,
 )
 from lcf3d.formats.nuscenes_tracking import write_tracking
+from lcf3d.formats.scans import read_scan
 from lcf3d.geometry.rotation import invert_rigid, rigid_transforms
 from lcf3d.structures import NUSCENES_CLASSES, Camera, Detections3D, FloatArray, Frame, IntArray, Sweep
 
@@ -51,15 +53,9 @@ def read_lidar(path: Path) -> NDArray[np.float32]:
 
     Raises:
         DatasetError: the file does not exist.
-        FormatError: it is cut off.
+        FormatError: it is cut off or no scan.
     """
-    try:
-        raw = path.read_bytes()
-    except FileNotFoundError:
-        raise DatasetError(f"scan {path} does not exist") from None
-    if len(raw) % 20:
-        raise FormatError(f"{path} is cut off: {len(raw)} bytes are no whole number of 20-byte points; copy it again")
-    points = np.frombuffer(raw, dtype="<f4").reshape(-1, 5)
+    points = read_scan(path, columns=5)
     points = points[np.isfinite(points[:, :4]).all(axis=1)]
     return np.stack([points[:, 1], -points[:, 0], points[:, 2], points[:, 3]], axis=1)
 
@@ -179,7 +175,7 @@ class NuscenesDataset(BaseDataset):
         """2D detections of a list by sample and camera (`lcf3d.formats.coco`)."""
         from lcf3d.datasets.nuscenes_results import NuscenesCameraResults
 
-        return NuscenesCameraResults(path, class_names)
+        return NuscenesCameraResults(path, class_names, self.camera_names, self.image_sizes())
 
     def writer(self, folder: Path) -> ResultWriter:
         """One submission of all samples."""
@@ -318,7 +314,7 @@ class NuscenesDataset(BaseDataset):
 
     def _path(self, data_row: int) -> Path:
         name: bytes = self.tables.sensor_data.filenames[data_row]
-        return self.root / name.decode()
+        return inside(self.root, name.decode())
 
     def _global_from_sensor(self, data_row: int) -> FloatArray:
         """(4, 4) global coordinates from raw sensor coordinates at the time of a recording."""

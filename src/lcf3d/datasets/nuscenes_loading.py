@@ -109,6 +109,10 @@ class _TokenIndex:
         return list(np.unique(self._sorted[1:][self._sorted[1:] == self._sorted[:-1]]))
 
 
+MOST_METRES = 1e9
+"""Nothing on Earth is farther from a map's origin."""
+
+
 @dataclass
 class _Reader:
     """Reads tables of one folder into columns and notes what is inconsistent."""
@@ -190,8 +194,8 @@ def _column(path: Path, records: list[dict[str, Any]], key: str, spec: _Spec) ->
     if records and column.shape != (len(records), *shape):
         expected = f"{' x '.join(map(str, shape))} numbers" if shape else "one value"
         raise DatasetError(f"{path}: {key!r} of a record cannot be read, expected {expected}")
-    if spec in (_VECTOR, _QUATERNION) and not np.isfinite(column).all():
-        raise DatasetError(f"{path}: {key!r} of a record holds NaN or infinite values")
+    if spec in (_VECTOR, _QUATERNION) and not (np.abs(column) < MOST_METRES).all():
+        raise DatasetError(f"{path}: {key!r} of a record holds NaN, infinite or impossibly large values")
     return column.reshape(len(records), *shape)
 
 
@@ -209,6 +213,7 @@ class _Calibrations:
 
 def _read_calibrations(reader: _Reader) -> _Calibrations:
     sensor = reader.columns("sensor", {"token": _TEXT, "channel": _TEXT})
+    # the intrinsics of anything but a camera are empty
     intrinsic: _Spec = (lambda value: value or [[np.nan] * 3] * 3, np.float64, (3, 3))
     table = reader.columns(
         "calibrated_sensor",

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
+import numpy as np
+
+from lcf3d.detectors.joins import LeftOut, join_cameras, join_classes, require_pixels
 from lcf3d.errors import FormatError
 from lcf3d.formats.coco import read_camera_detections
 from lcf3d.provenance import FusedDetections
@@ -26,6 +30,7 @@ class NuscenesLidarResults:
     ) -> None:
         self.path, self._frames, self.missing = path, frames, missing
         self.class_names = tuple(class_names)
+        self.left_out = LeftOut(path)
 
     def load(self, frame_ids: Sequence[str]) -> None:
         """See that the file has these samples.
@@ -39,12 +44,33 @@ class NuscenesLidarResults:
                 f"{self.path} lacks {len(absent)} of {len(frame_ids)} samples, the first is {absent[0]}"
                 + ("; --missing empty takes them as samples without detections" if self.missing == "error" else "")
             )
+        if len(frame_ids) > 1:
+            self._count(set(frame_ids))
+
+    def _count(self, frame_ids: set[str]) -> None:
+        """Note which detections are taken."""
+        self.left_out = LeftOut(self.path)
+        for token, found in self._frames.items():
+            joined = join_classes(found.class_names, self.class_names)
+            if token not in frame_ids:
+                self.left_out.frames[token] += len(found)
+                continue
+            for label, count in Counter(found.labels.tolist()).items():
+                name = found.class_names[label]
+                if name in joined:
+                    self.left_out.taken += count
+                    self.left_out.seen.add(joined[name])
+                else:
+                    self.left_out.classes[name] += count
+        self.left_out.require_some(self.class_names)
 
     def detect(self, frame: Frame) -> Detections3D:
         """The detections of one sample in its LiDAR frame."""
         self.load([frame.id] if self.missing == "error" else [])
         found = self._frames.get(frame.id)
-        return Detections3D.empty(self.class_names) if found is None else found.with_classes(self.class_names)
+        if found is None:
+            return Detections3D.empty(self.class_names)
+        return found.with_classes(self.class_names, join_classes(found.class_names, self.class_names))
 
 
 class NuscenesCameraResults:
@@ -53,14 +79,51 @@ class NuscenesCameraResults:
     Args:
         path: the JSON file.
         class_names: classes to take.
+        camera_names: the dataset's cameras.
+        sizes: (width, height) of the images by camera, to tell boxes of another form.
 
     Raises:
         FormatError: not such a list; names the record.
     """
 
-    def __init__(self, path: str | Path, class_names: Sequence[str]) -> None:
-        self._found = read_camera_detections(Path(path), class_names)
+    def __init__(
+        self,
+        path: str | Path,
+        class_names: Sequence[str],
+        camera_names: Sequence[str],
+        sizes: Mapping[str, tuple[int, int]] | None = None,
+    ) -> None:
+        self.left_out = LeftOut(Path(path))
+        self._class_names, self._camera_names = tuple(class_names), tuple(camera_names)
+        found = read_camera_detections(Path(path), class_names, self.left_out)
+        joined = join_cameras({camera for _, camera in found}, camera_names)
+        self._found = {(token, joined[camera]): one for (token, camera), one in found.items() if camera in joined}
+        for camera in camera_names:
+            boxes = [one.boxes for (_, name), one in self._found.items() if name == camera]
+            if boxes:
+                require_pixels(np.concatenate(boxes), path, (sizes or {}).get(camera))
+        for (_, camera), one in found.items():
+            if camera not in joined:
+                self.left_out.cameras[camera] += len(one)
         self._empty = Detections2D.empty(class_names)
+
+    def load(self, frame_ids: Sequence[str]) -> None:
+        """See that there are detections of these samples.
+
+        Raises:
+            DatasetError: all are of other samples, cameras or classes.
+        """
+        known = set(frame_ids)
+        out = self.left_out
+        out.frames = Counter()
+        out.taken, out.seen = 0, set()
+        for (token, _), one in self._found.items():
+            if token in known:
+                out.taken += len(one)
+                out.seen |= {one.class_names[label] for label in set(one.labels.tolist())}
+            else:
+                out.frames[token] += len(one)
+        out.require_some(self._class_names, self._camera_names)
 
     def sees(self, frame: Frame, camera: str) -> bool:
         """Always: a camera without detections looked and saw nothing."""

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from lcf3d.errors import DatasetError
+from lcf3d.errors import DatasetError, FormatError
+from lcf3d.files import read_text
 
 _SCENE_NUMBERS = {
     "mini_train": "61 553 655 757 796 1077 1094 1100",
@@ -50,8 +51,8 @@ def scenes_of_split(split: str) -> frozenset[str]:
             f"split {split!r} is neither one of {', '.join(SPLITS)} nor a text file with one scene name a line"
         )
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except UnicodeDecodeError:
+        lines = read_text(path).splitlines()
+    except FormatError:
         raise DatasetError(f"{path} is not a text file with one scene name a line") from None
     return frozenset(line.strip() for line in lines if line.strip())
 

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
+from lcf3d.detectors.joins import LeftOut, join_cameras, join_classes, require_pixels
 from lcf3d.errors import DatasetError
+from lcf3d.files import inside, list_files
 from lcf3d.formats.plain import read_detections_2d, read_detections_3d, write_detections_3d
 from lcf3d.provenance import FusedDetections
 from lcf3d.structures import Detections2D, Detections3D, Frame
@@ -30,6 +33,8 @@ class _PlainResults:
         self.folder = path / "data" if (path / "data").is_dir() else path
         self.class_names = tuple(class_names)
         self.missing = missing
+        self.camera_names: tuple[str, ...] = ()
+        self.left_out = LeftOut(self.folder)
 
     def load(self, frame_ids: Sequence[str]) -> None:
         """See that there are results of these frames.
@@ -42,9 +47,29 @@ class _PlainResults:
             raise DatasetError(
                 f"{self.folder} lacks the results of {len(absent)} of {len(frame_ids)} frames, first {absent[0]}.json"
             )
+        self.left_out = LeftOut(self.folder)
+        missing = set(absent)
+        for frame_id in frame_ids:
+            if frame_id not in missing:
+                self._count(self._path(frame_id))
+        self.left_out.require_some(self.class_names, self.camera_names)
+
+    def _count(self, path: Path) -> None:
+        """Note what of a file is taken."""
+        raise NotImplementedError
+
+    def _count_classes(self, found: Detections2D | Detections3D) -> None:
+        joined = join_classes(found.class_names, self.class_names)
+        for label, count in Counter(found.labels.tolist()).items():
+            name = found.class_names[label]
+            if name in joined:
+                self.left_out.taken += count
+                self.left_out.seen.add(joined[name])
+            else:
+                self.left_out.classes[name] += count
 
     def _path(self, frame_id: str) -> Path:
-        return self.folder / f"{frame_id}.json"
+        return inside(self.folder, frame_id, ".json")
 
     def _file(self, frame_id: str) -> Path | None:
         """The file of a frame, None where it may be missing."""
@@ -57,16 +82,40 @@ class _PlainResults:
 class PlainLidarResults(_PlainResults):
     """3D detections, see `lcf3d.formats.plain`."""
 
+    def _count(self, path: Path) -> None:
+        self._count_classes(read_detections_3d(path))
+
     def detect(self, frame: Frame) -> Detections3D:
         """The detections of one frame."""
         path = self._file(frame.id)
         if path is None:
             return Detections3D.empty(self.class_names)
-        return read_detections_3d(path).with_classes(self.class_names)
+        found = read_detections_3d(path)
+        return found.with_classes(self.class_names, join_classes(found.class_names, self.class_names))
 
 
 class PlainCameraResults(_PlainResults):
-    """2D detections by camera, see `lcf3d.formats.plain`."""
+    """2D detections by camera, see `lcf3d.formats.plain`.
+
+    Args:
+        camera_names: the dataset's cameras; those of the files are joined to them by name.
+    """
+
+    def __init__(
+        self, folder: Path | str, class_names: Sequence[str], missing: str = "error", camera_names: Sequence[str] = ()
+    ) -> None:
+        super().__init__(folder, class_names, missing)
+        self.camera_names = tuple(camera_names)
+
+    def _count(self, path: Path) -> None:
+        found = read_detections_2d(path)
+        joined = join_cameras(found, self.camera_names)
+        for camera, one in found.items():
+            if camera in joined or not self.camera_names:
+                require_pixels(one.boxes, path)
+                self._count_classes(one)
+            else:
+                self.left_out.cameras[camera] += len(one)
 
     def sees(self, frame: Frame, camera: str) -> bool:
         """Always: a camera without detections looked and saw nothing."""
@@ -76,9 +125,12 @@ class PlainCameraResults(_PlainResults):
         """The detections of one camera of one frame, clipped to its image."""
         path = self._file(frame.id)
         found = read_detections_2d(path) if path is not None else {}
-        if camera not in found:
+        own = next((name for name, target in join_cameras(found, [camera]).items() if target == camera), None)
+        if own is None:
             return Detections2D.empty(self.class_names)
-        return found[camera].with_classes(self.class_names).clipped(frame.camera(camera))
+        one = found[own]
+        joined = one.with_classes(self.class_names, join_classes(one.class_names, self.class_names))
+        return joined.clipped(frame.camera(camera))
 
 
 class PlainWriter:
@@ -93,7 +145,7 @@ class PlainWriter:
 
     def write(self, frame: Frame, fused: FusedDetections) -> None:
         """Write the fused detections of a frame."""
-        write_detections_3d(self.folder / f"{frame.id}.json", fused.detections)
+        write_detections_3d(inside(self.folder, frame.id, ".json"), fused.detections)
 
     def is_done(self, frame_id: str) -> bool:
         """Whether the file of a frame is there."""
@@ -104,4 +156,4 @@ class PlainWriter:
 
     def written(self) -> Iterator[Path]:
         """The files of all frames."""
-        yield from sorted(self.folder.glob("[!.]*.json"))
+        yield from list_files(self.folder, ".json")

@@ -24,6 +24,7 @@ from typing import TypeVar
 
 import numpy as np
 
+from lcf3d.files import read_text
 from lcf3d.geometry.iou import image_area
 from lcf3d.structures import Detections2D, Detections3D, InstanceMask, IntArray
 
@@ -69,7 +70,7 @@ def read_class_names(names: str | Sequence[str]) -> tuple[str, ...]:
     if not isinstance(names, str):
         return tuple(names)
     if Path(names).is_file():
-        lines = Path(names).read_text(encoding="utf-8").splitlines()
+        lines = read_text(Path(names)).splitlines()
         return tuple(line.strip() for line in lines if line.strip())
     return tuple(name.strip() for name in names.split(",") if name.strip())
 
@@ -117,6 +118,17 @@ def to_classes(
     # a name that maps to nothing must not slip through by being equal to a target name
     full = {name: names.get(name, "") for name in detections.class_names}
     return detections.with_classes(class_names, full)
+
+
+def reported_classes(
+    own: Sequence[str], class_names: Sequence[str], mapping: Mapping[str, str] | None = None
+) -> tuple[str, ...]:
+    """The classes of ``class_names`` that a detector of the classes ``own`` can report after `to_classes`."""
+    if tuple(own) == tuple(class_names):
+        return tuple(class_names)
+    riders = [rider for mount, rider in RIDDEN.items() if PERSON in own and mount in own]
+    names = {**class_mapping([*own, *riders], class_names), **(mapping or {})}
+    return tuple(name for name in class_names if name in names.values())
 
 
 def join_riders(detections: Detections2D) -> Detections2D:

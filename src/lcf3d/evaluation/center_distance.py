@@ -9,8 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
+from lcf3d.kernels import kernel
 from lcf3d.structures import BoolArray, FloatArray, IntArray
 
 ERRORS = ("trans_err", "scale_err", "orient_err", "vel_err", "attr_err")
@@ -200,7 +200,7 @@ def _weighted_aps(hits: BoolArray, drawn: IntArray, objects: IntArray, first: in
     return aps
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _greedy_matches(annotated, starts, predicted, groups, thresholds):  # type: ignore[no-untyped-def]
     """(T, N) row of ``annotated`` that each of ``predicted`` takes in turn; group g has rows starts[g]:starts[g+1]."""
     matches = np.full((len(thresholds), len(predicted)), -1, dtype=np.int64)

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numba import njit
 
 from lcf3d.errors import ShapeError
+from lcf3d.kernels import kernel
 from lcf3d.structures import FloatArray, IntArray
 
 # the official KITTI program samples precision at 41 recall positions, 0, 1/40, ..., 1
@@ -134,7 +134,7 @@ def _best_at_higher_recall(curves: FloatArray) -> FloatArray:
     return np.maximum.accumulate(curves[:, ::-1], axis=1)[:, ::-1]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _sample_curves(  # type: ignore[no-untyped-def]
     weights, object_counts, hit_scores, hit_frames, scores, frames, true_positives, false_positives, similarity
 ):

@@ -18,6 +18,7 @@ import numpy as np
 from lcf3d.errors import ConfigError, DatasetError, FormatError
 from lcf3d.evaluation.curves import SAMPLES, PrecisionCurve, Sampling, ScoreEvents, precision_curve
 from lcf3d.evaluation.kitti_matching import COUNTS, IGNORED, OTHER, match_at, overlaps, score_events
+from lcf3d.files import list_files
 from lcf3d.formats.kitti import KittiFrames, read_folder, read_frame_ids
 from lcf3d.structures import FloatArray, IntArray
 
@@ -335,9 +336,9 @@ def split_frame_ids(root: Path, split: str | None = None) -> tuple[str, ...]:
     labels = root / "training" / "label_2"
     if not labels.is_dir():
         raise DatasetError(f"{labels} is not a folder; expected a KITTI tree with training/label_2 in {root}")
-    known = sorted(path.stem for path in (root / "ImageSets").glob("*.txt"))
+    known = [path.stem for path in list_files(root / "ImageSets", ".txt")]
     if split is None and "val" not in known:
-        frame_ids = tuple(sorted(path.stem for path in labels.glob("*.txt")))
+        frame_ids = tuple(path.stem for path in list_files(labels, ".txt"))
         if not frame_ids:
             raise DatasetError(f"{labels} holds no label files")
         return frame_ids

@@ -9,11 +9,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
 from lcf3d.evaluation.curves import ScoreEvents
 from lcf3d.formats.kitti import KittiFrames
 from lcf3d.geometry.iou import bev_intersection
+from lcf3d.kernels import kernel
 from lcf3d.structures import FloatArray, IntArray
 
 # what an object or a detection is to the class and difficulty at hand
@@ -143,7 +143,7 @@ def _box_rows(frames: KittiFrames) -> FloatArray:
     return rows
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _overlaps(  # type: ignore[no-untyped-def]
     object_starts, detection_starts, pairs, is_dontcare, object_boxes, object_rows, detection_boxes, detection_rows
 ):
@@ -176,7 +176,7 @@ def _overlaps(  # type: ignore[no-untyped-def]
     return bbox, bev, volume
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _candidates(  # type: ignore[no-untyped-def]
     first_object, last_object, first_detection, last_detection, pair, overlap, min_overlap, object_codes,
     detection_codes, is_dontcare, cover, candidate_starts, candidates, candidate_overlaps
@@ -200,7 +200,7 @@ def _candidates(  # type: ignore[no-untyped-def]
     return n_candidates
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _assign(  # type: ignore[no-untyped-def]
     first_object, last_object, threshold, object_codes, detection_codes, scores, candidate_starts, candidates,
     candidate_overlaps, assigned, matches
@@ -228,7 +228,7 @@ def _assign(  # type: ignore[no-untyped-def]
             assigned[best] = True
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _take_highest_scores(  # type: ignore[no-untyped-def]
     first_object, last_object, scores, candidate_starts, candidates, assigned, matches
 ):
@@ -246,7 +246,7 @@ def _take_highest_scores(  # type: ignore[no-untyped-def]
             assigned[best] = True
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _count_matches(  # type: ignore[no-untyped-def]
     first_object, last_object, matches, object_codes, detection_codes, cover, object_alpha, detection_alpha
 ):
@@ -263,7 +263,7 @@ def _count_matches(  # type: ignore[no-untyped-def]
     return true, taken, similar
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _score_events(  # type: ignore[no-untyped-def]
     object_starts, detection_starts, pairs, overlap, min_overlap, object_codes, detection_codes, is_dontcare,
     object_alpha, detection_alpha, scores, order
@@ -327,7 +327,7 @@ def _score_events(  # type: ignore[no-untyped-def]
     return objects, hits[:n_hits].copy(), events[:n_events].copy()
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _match_at(  # type: ignore[no-untyped-def]
     object_starts, detection_starts, pairs, overlap, min_overlap, object_codes, detection_codes, is_dontcare, scores,
     threshold

@@ -13,7 +13,7 @@ from lcf3d.evaluation.curves import best_f1_score
 from lcf3d.evaluation.kitti import KittiEvaluator, Selection
 from lcf3d.evaluation.kitti_matching import COUNTS, FALSE_POSITIVE, TRUE_POSITIVE
 from lcf3d.evaluation.study import FusionOutcomes
-from lcf3d.files import read_json
+from lcf3d.files import read_json, reading
 from lcf3d.formats.kitti import KittiFrames, KittiObjects
 from lcf3d.geometry.boxes import kitti_from_lidar
 from lcf3d.provenance import FusedDetections, Outcome, Reason
@@ -67,7 +67,7 @@ def read_provenance(results: Path, frame_ids: tuple[str, ...]) -> dict[str, Fuse
     if not folder.is_dir():
         return {}
     paths = {frame_id: folder / f"{frame_id}.json" for frame_id in frame_ids}
-    return {frame_id: FusedDetections.from_json(read_json(path)) for frame_id, path in paths.items() if path.is_file()}
+    return {frame_id: _fused(path) for frame_id, path in paths.items() if path.is_file()}
 
 
 def fusion_outcomes(
@@ -185,3 +185,8 @@ def _dropped_boxes(
         )
         reasons += [Reason(code).name.lower() for code in fused.lidar.reason[rows]]
     return KittiFrames.from_frames(evaluator.truth.frame_ids, frames), np.array(reasons, dtype=np.str_)
+
+
+def _fused(path: Path) -> FusedDetections:
+    with reading(path, "the provenance of a frame"):
+        return FusedDetections.from_json(read_json(path))

@@ -29,6 +29,7 @@ from lcf3d.evaluation.kitti_outcomes import read_provenance
 from lcf3d.evaluation.kitti_study import study
 from lcf3d.evaluation.protocol import ComparisonRow, EvaluationOptions, TableData, Verdict, refuse_options
 from lcf3d.evaluation.study import Study
+from lcf3d.files import list_files
 from lcf3d.formats.kitti import (
     KittiFrames,
     KittiObjects,
@@ -151,7 +152,7 @@ class KittiEvaluation:
         kept: Literal["error", "empty"] = "empty" if missing == "empty" else "error"
         results = read_folder(folder, self.frame_ids, results=True, missing=kept)
         known = set(self.frame_ids)
-        others = sorted(p.stem for p in folder.glob("[!.]*.txt") if p.stem not in known)
+        others = sorted(p.stem for p in list_files(folder, ".txt") if p.stem not in known)
         notes = []
         if others:
             notes.append(

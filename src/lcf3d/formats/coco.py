@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lcf3d.detectors.joins import LeftOut, join_classes
 from lcf3d.errors import FormatError
-from lcf3d.files import read_json, write_json
+from lcf3d.files import read_json, shortened, write_json
 from lcf3d.structures import Detections2D, InstanceMask
 
 CameraDetections = dict[tuple[str, str], Detections2D]
@@ -96,17 +97,15 @@ def pack_counts(runs: Sequence[int]) -> str:
     return "".join(characters)
 
 
-def read_camera_detections(path: Path, class_names: Sequence[str]) -> CameraDetections:
+def read_camera_detections(path: Path, class_names: Sequence[str], left_out: LeftOut | None = None) -> CameraDetections:
     """Detections of a simple list (see the module's text) by (sample token, camera), with masks where there are some.
 
-    Classes missing from ``class_names`` are left out.
+    Classes that are none of ``class_names`` (`lcf3d.detectors.joins`) are left out and counted in ``left_out``.
 
     Raises:
         FormatError: not such a list; the message names the record.
     """
-    return _group(
-        path, _records(path), lambda r: (str(r["sample_token"]), str(r["camera"])), "category_name", class_names
-    )
+    return _group(path, _records(path), lambda r: (str(r["sample_token"]), str(r["camera"])), class_names, left_out)
 
 
 def write_camera_detections(path: Path, detections: Mapping[tuple[str, str], Detections2D]) -> None:
@@ -132,6 +131,7 @@ def read_coco_results(
     class_names: Sequence[str],
     categories: Mapping[int, str],
     images: Mapping[int | str, tuple[str, str]],
+    left_out: LeftOut | None = None,
 ) -> CameraDetections:
     """Detections of a COCO results file by (frame id, camera), with masks where there are some.
 
@@ -140,6 +140,7 @@ def read_coco_results(
         class_names: classes to keep; others are left out.
         categories: name by ``category_id`` (`read_coco_index`).
         images: (frame id, camera) by ``image_id`` (`read_coco_index`).
+        left_out: counts detections of other classes.
 
     Raises:
         FormatError: not such a file, or it names an image or category that is not known.
@@ -147,10 +148,12 @@ def read_coco_results(
     records = _records(path)
     for i, record in enumerate(records):
         for key, known in (("category_id", categories), ("image_id", images)):
-            if key not in record or record[key] not in known:
-                raise FormatError(f"{path}: record {i} has {key} {record.get(key)!r}, which the index does not name")
+            if key not in record or not isinstance(record[key], int | str) or record[key] not in known:
+                raise FormatError(
+                    f"{path}: record {i} has {key} {shortened(record.get(key))}, which the index does not name"
+                )
     named = [{**record, "category_name": categories[record["category_id"]]} for record in records]
-    return _group(path, named, lambda r: images[r["image_id"]], "category_name", class_names)
+    return _group(path, named, lambda r: images[r["image_id"]], class_names, left_out)
 
 
 def read_coco_index(
@@ -169,12 +172,42 @@ def read_coco_index(
     try:
         categories = {int(record["id"]): str(record["name"]) for record in index["categories"]}
         files = {record["id"]: str(record["file_name"]) for record in index["images"]}
-    except (KeyError, TypeError, ValueError):
+    except (KeyError, TypeError, ValueError, OverflowError):
         raise FormatError(
             f"{path} must hold 'categories' with id and name and 'images' with id and file_name"
         ) from None
-    by_name = {Path(name).name: frame for name, frame in frames_of_files.items()}
-    return categories, {i: by_name[Path(name).name] for i, name in files.items() if Path(name).name in by_name}
+    frames = _by_path_end(frames_of_files)
+    found = {i: _frame_of(name, frames, path) for i, name in files.items()}
+    return categories, {i: frame for i, frame in found.items() if frame is not None}
+
+
+def _by_path_end(frames_of_files: Mapping[str, tuple[str, str]]) -> dict[str, set[tuple[str, str]]]:
+    """The frames whose image path ends in each sequence of its last parts."""
+    found: dict[str, set[tuple[str, str]]] = {}
+    for name, frame in frames_of_files.items():
+        parts = Path(name).parts
+        for first in range(len(parts)):
+            found.setdefault("/".join(parts[first:]), set()).add(frame)
+    return found
+
+
+def _frame_of(name: str, frames: Mapping[str, set[tuple[str, str]]], path: Path) -> tuple[str, str] | None:
+    """The frame of a file name: of as many of its last parts as are needed to tell.
+
+    Raises:
+        FormatError: several images end in the whole name.
+    """
+    parts = Path(name).parts
+    for first in range(len(parts)):
+        candidates = frames.get("/".join(parts[first:]), set())
+        if len(candidates) == 1:
+            return next(iter(candidates))
+        if candidates:
+            raise FormatError(
+                f"{path}: {shortened(name)} fits {len(candidates)} images of the dataset; write more of their paths "
+                "into file_name"
+            )
+    return None
 
 
 def _records(path: Path) -> list[dict[str, Any]]:
@@ -185,16 +218,17 @@ def _records(path: Path) -> list[dict[str, Any]]:
 
 
 def _group(
-    path: Path, records: list[dict[str, Any]], key: Any, category: str, class_names: Sequence[str]
+    path: Path, records: list[dict[str, Any]], key: Any, class_names: Sequence[str], left_out: LeftOut | None
 ) -> CameraDetections:
     """Detections of ``records`` by ``key``."""
     names = tuple(class_names)
-    label_of = {name: i for i, name in enumerate(names)}
+    own = {str(record.get("category_name")) for record in records}
+    label_of = {name: names.index(target) for name, target in join_classes(own, names).items()}
     rows: dict[tuple[str, str], list[tuple[list[float], float, int, InstanceMask | None]]] = {}
     for i, record in enumerate(records):
         try:
             x, y, width, height = (float(n) for n in record["bbox"])
-            score, name, place = float(record["score"]), str(record[category]), key(record)
+            score, name, place = float(record["score"]), str(record["category_name"]), key(record)
         except KeyError as error:
             raise FormatError(f"{path}: record {i} has no {error.args[0]!r}") from None
         except (TypeError, ValueError, OverflowError):
@@ -204,6 +238,8 @@ def _group(
         # an image whose detections are all of other classes has been looked at: it stays, empty
         found = rows.setdefault(place, [])
         if name not in label_of:
+            if left_out is not None:
+                left_out.classes[name] += 1
             continue
         mask = None
         if record.get("segmentation"):

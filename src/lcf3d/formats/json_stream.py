@@ -8,7 +8,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from lcf3d.errors import FormatError
+from lcf3d.errors import DatasetError, FormatError
+from lcf3d.files import reading, require_file
 
 _SPACE = re.compile(r"\s*")
 _RECORD_END = re.compile(r"\}\s*(?=,)")
@@ -73,7 +74,8 @@ def iterate_records(path: Path, batch_bytes: int = BATCH_BYTES) -> Iterator[list
         FormatError: the file is absent or not such a list.
     """
     try:
-        with path.open(encoding="utf-8") as file:
+        require_file(path)
+        with reading(path, "a JSON list"), path.open(encoding="utf-8-sig") as file:
             pending = file.read(batch_bytes).lstrip()
             if not pending.startswith("["):
                 raise FormatError(f"{path} must hold a list of records, it begins with {pending[:20]!r}")
@@ -90,13 +92,12 @@ def iterate_records(path: Path, batch_bytes: int = BATCH_BYTES) -> Iterator[list
                     pending = pending[end:].lstrip()[1:]
                     yield batch
                     break
-            last = json.loads("[" + pending)
-    except FileNotFoundError:
-        raise FormatError(f"{path} does not exist") from None
-    except json.JSONDecodeError as error:
-        raise FormatError(f"{path} is not a valid JSON list ({error.msg}); it may be cut off") from None
-    except UnicodeDecodeError:
-        raise FormatError(f"{path} is not a text file in UTF-8") from None
+            try:
+                last = json.loads("[" + pending)
+            except json.JSONDecodeError as error:
+                raise FormatError(f"{path} is not a valid JSON list ({error.msg}); it may be cut off") from None
+    except DatasetError as error:
+        raise FormatError(str(error)) from None
     if last and not isinstance(last[0], dict):
         raise FormatError(f"{path} must hold a list of records, it holds {type(last[0]).__name__}s")
     yield last

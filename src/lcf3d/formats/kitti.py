@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, overload
 
@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lcf3d.errors import DatasetError, FormatError, ShapeError
-from lcf3d.files import write_text
+from lcf3d.files import read_text, write_text
 from lcf3d.formats.kitti_text import (
     LABEL_COLUMNS,
     NO_LOCATION,
@@ -25,7 +25,6 @@ from lcf3d.formats.kitti_text import (
     RESULT_COLUMNS,
     has_box3d,
     parse_files,
-    read_text,
 )
 from lcf3d.geometry.boxes import kitti_from_lidar, lidar_from_kitti, observation_angle
 from lcf3d.structures import Detections2D, Detections3D, FloatArray, IntArray
@@ -315,6 +314,12 @@ def objects_from_detections_2d(detections: Detections2D) -> KittiObjects:
         np.full(n, NO_ANGLE),
         detections.scores,
     )
+
+
+def renamed(objects: KittiObjects, name: str, target: str) -> KittiObjects:
+    """The objects with class ``name`` called ``target``."""
+    names = objects.class_names.tolist()
+    return replace(objects, class_names=np.array([target if n == name else n for n in names], dtype=np.str_))
 
 
 def _labels(objects: KittiObjects, class_names: Sequence[str]) -> IntArray:

@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lcf3d.errors import FormatError
+from lcf3d.files import read_text
 from lcf3d.formats.kitti import KittiObjects
-from lcf3d.formats.kitti_text import parse_tracking, read_text
+from lcf3d.formats.kitti_text import parse_tracking
 from lcf3d.geometry.boxes import wrap_angle
 from lcf3d.geometry.rotation import rotation_matrices
 from lcf3d.structures import FloatArray, IntArray

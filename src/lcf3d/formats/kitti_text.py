@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lcf3d.errors import DatasetError, FormatError, Lcf3dError
+from lcf3d.errors import FormatError, Lcf3dError
+from lcf3d.files import read_text
 from lcf3d.structures import BoolArray, FloatArray, IntArray
 
 NO_SIZE = -1.0
@@ -25,24 +26,6 @@ def has_box3d(dimensions: FloatArray, locations: FloatArray) -> BoolArray:
     no_size = (dimensions == NO_SIZE).all(axis=1) | (dimensions == NO_LOCATION).all(axis=1)
     known: BoolArray = ~(no_size | (locations == NO_LOCATION).all(axis=1))
     return known
-
-
-def read_text(path: Path) -> str:
-    """The text of a file.
-
-    Raises:
-        DatasetError: it does not exist or is a folder.
-        FormatError: it is not UTF-8.
-    """
-    try:
-        with open(path, "rb", buffering=0) as file:
-            return file.read().decode("utf-8")
-    except FileNotFoundError:
-        raise DatasetError(f"{path} does not exist") from None
-    except IsADirectoryError:
-        raise DatasetError(f"{path} is a folder; expected a text file") from None
-    except UnicodeDecodeError:
-        raise FormatError(f"{path} is not a text file in UTF-8") from None
 
 
 def parse_files(paths: Sequence[Path | None], columns: int) -> tuple[NDArray[np.str_], FloatArray, list[int]]:

@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 
 from lcf3d.errors import FormatError
-from lcf3d.files import write_text
+from lcf3d.files import read_text, write_text
 from lcf3d.formats.kitti import KittiObjects, format_objects, objects_from_table
-from lcf3d.formats.kitti_text import LABEL_COLUMNS, RESULT_COLUMNS, read_text
+from lcf3d.formats.kitti_text import LABEL_COLUMNS, RESULT_COLUMNS
 from lcf3d.structures import IntArray
 
 

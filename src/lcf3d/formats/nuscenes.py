@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from lcf3d.errors import FormatError
-from lcf3d.files import write_text
+from lcf3d.errors import DatasetError, FormatError
+from lcf3d.files import read_text, reading, write_text
 from lcf3d.formats.json_stream import JsonCursor
 from lcf3d.formats.nuscenes_boxes import NUSCENES_ATTRIBUTES, GlobalBoxes
 from lcf3d.structures import NUSCENES_CLASSES, BoolArray, FloatArray
@@ -43,11 +43,9 @@ def read_submission(path: Path, max_boxes: int = MAX_BOXES_PER_SAMPLE) -> tuple[
             size that is not positive. The message names the file and the sample.
     """
     try:
-        cursor = JsonCursor(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise FormatError(f"{path} does not exist") from None
-    except UnicodeDecodeError:
-        raise FormatError(f"{path} is not a text file in UTF-8") from None
+        cursor = JsonCursor(read_text(path))
+    except DatasetError as error:
+        raise FormatError(str(error)) from None
     except OSError as error:
         raise FormatError(f"{path} cannot be read ({error.strerror})") from None
     tokens: list[str] = []
@@ -55,16 +53,17 @@ def read_submission(path: Path, max_boxes: int = MAX_BOXES_PER_SAMPLE) -> tuple[
     meta: dict[str, Any] | None = None
     found = False
     try:
-        for key in cursor.members():
-            if key == "results":
-                found = True
-                for token in cursor.members():
-                    tokens.append(token)
-                    parts.append(_read_sample(path, token, cursor.value(), max_boxes))
-            elif key == "meta":
-                meta = cursor.value()
-            else:
-                cursor.value()
+        with reading(path, "a nuScenes submission"):
+            for key in cursor.members():
+                if key == "results":
+                    found = True
+                    for token in cursor.members():
+                        tokens.append(token)
+                        parts.append(_read_sample(path, token, cursor.value(), max_boxes))
+                elif key == "meta":
+                    meta = cursor.value()
+                else:
+                    cursor.value()
     except json.JSONDecodeError as error:
         raise FormatError(f"{path}:{error.lineno}:{error.colno}: not a nuScenes submission ({error.msg})") from None
     if not found:

@@ -13,11 +13,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numba import njit
 
 from lcf3d.geometry.boxes import box_corners
 from lcf3d.geometry.camera import cut_by_field
 from lcf3d.geometry.lens import local_projection
+from lcf3d.kernels import kernel
 from lcf3d.structures import BoolArray, Camera, FloatArray, IntArray
 
 STATE = 9
@@ -261,7 +261,7 @@ def _edges(pairs: BoxPairs, state: FloatArray) -> tuple[FloatArray, FloatArray]:
     return residuals, jacobian
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _fill_edges(  # type: ignore[no-untyped-def]
     corners, velocities, matrices, edges, focal, spread, turn, state, residuals, jacobian
 ):
@@ -300,7 +300,7 @@ def _fill_edges(  # type: ignore[no-untyped-def]
             jacobian[n, e, 6 + a] = inward / sigma
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _multiply(matrix, vector, result):  # type: ignore[no-untyped-def]
     """``result`` (3,) = (3, 3) ``matrix`` times (3,) ``vector``."""
     for i in range(3):

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numba import njit
 
 from lcf3d.geometry.iou import turned_intersection
+from lcf3d.kernels import kernel
 from lcf3d.structures import FloatArray, IntArray
 
 Clustering = Literal["cliques", "components", "nms"]
@@ -74,7 +74,7 @@ def cluster_boxes(
     return Clusters(clusters, order[first[numbers >= 0]])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _links(boxes, labels, iou_threshold, class_aware):  # type: ignore[no-untyped-def]
     """Linked later boxes of every box: (E,) neighbours in ascending order and (N + 1,) offsets.
 
@@ -134,7 +134,7 @@ def _links(boxes, labels, iou_threshold, class_aware):  # type: ignore[no-untype
     return neighbours[:links], offsets
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _partition(neighbours, offsets, method):  # type: ignore[no-untyped-def]
     """Cluster index of boxes sorted by descending score, from their links; ``method`` is a code of ``_CODES``."""
     n = len(offsets) - 1
@@ -174,7 +174,7 @@ def _partition(neighbours, offsets, method):  # type: ignore[no-untyped-def]
     return cluster
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _components(neighbours, offsets):  # type: ignore[no-untyped-def]
     """Connected components, numbered by their first box."""
     n = len(offsets) - 1

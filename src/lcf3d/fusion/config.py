@@ -11,8 +11,8 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 from typing_extensions import Self
 
-from lcf3d.errors import ConfigError
-from lcf3d.files import write_text
+from lcf3d.errors import ConfigError, FormatError
+from lcf3d.files import read_text, reading, write_text
 from lcf3d.fusion.evidence import ROLE_EVIDENCE, Evidence
 from lcf3d.fusion.roles import ROLES, role_of
 from lcf3d.structures import ARGOVERSE_CLASSES, KITTI_CLASSES, NUSCENES_CLASSES, FloatArray
@@ -155,9 +155,10 @@ class FusionConfig(BaseModel):
         if not path.is_file():
             raise ConfigError(f"{str(name_or_path)!r} is neither a preset ({', '.join(PRESETS)}) nor a file")
         try:
-            values = yaml.safe_load(path.read_text(encoding="utf-8"))
-        except yaml.YAMLError as error:
-            raise ConfigError(f"{path} is not valid YAML: {str(error).splitlines()[0]}") from None
+            with reading(path, "settings"):
+                values = _yaml(path)
+        except FormatError as error:
+            raise ConfigError(str(error)) from None
         if not isinstance(values, dict):
             raise ConfigError(f"{path} must hold settings as 'name: value' lines")
         return cls.of({**own, **values}, source=str(path))
@@ -170,7 +171,9 @@ class FusionConfig(BaseModel):
             ConfigError: an unknown name or a value that makes no sense; names the setting and ``source``.
         """
         try:
-            return cls(**values)
+            return cls.model_validate(values)
+        except (RecursionError, OverflowError, TypeError) as error:
+            raise ConfigError(f"{source}: a value cannot be read ({error})") from None
         except ValidationError as error:
             first = error.errors()[0]
             name = ".".join(str(part) for part in first["loc"])
@@ -253,3 +256,15 @@ PRESETS: dict[str, dict[str, Any]] = {
     # measured with simulated camera detections only: docs/argoverse2.md
     "argoverse2": {"class_names": ARGOVERSE_CLASSES, "relabel_score": 0.8},
 }
+
+
+def _yaml(path: Path) -> Any:
+    """The value of a YAML file.
+
+    Raises:
+        ConfigError: it is no YAML.
+    """
+    try:
+        return yaml.safe_load(read_text(path))
+    except yaml.YAMLError as error:
+        raise ConfigError(f"{path} is not valid YAML: {str(error).splitlines()[0]}") from None

@@ -7,12 +7,12 @@ from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from lcf3d.geometry.boxes import YAW, wrap_angle
 from lcf3d.geometry.camera import pixel_rays
 from lcf3d.geometry.lens import NEAR, lens_numbers, project_through_lens
+from lcf3d.kernels import kernel
 from lcf3d.structures import BoolArray, Camera, Detections2D, FloatArray, IntArray
 
 MaskMode = Literal["box", "mask", "box+mask"]
@@ -140,7 +140,7 @@ def points_in_image_boxes(
     return index, at, offsets
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _bend_into(points, numbers, boxes):  # type: ignore[no-untyped-def]
     """`_project_into` for a lens, whose numbers are those of `lens_numbers`."""
     u1, v1, u2, v2 = _around(boxes)
@@ -156,7 +156,7 @@ def _bend_into(points, numbers, boxes):  # type: ignore[no-untyped-def]
     return found[:count], pixels[found[:count]]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _around(boxes):  # type: ignore[no-untyped-def]
     """The rectangle around all boxes."""
     u1, v1, u2, v2 = np.inf, np.inf, -np.inf, -np.inf
@@ -166,7 +166,7 @@ def _around(boxes):  # type: ignore[no-untyped-def]
     return u1, v1, u2, v2
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _by_box(candidates, pixels, boxes):  # type: ignore[no-untyped-def]
     """What `points_in_image_boxes` returns, of candidate points at pixels."""
     offsets = np.zeros(len(boxes) + 1, np.int64)
@@ -186,7 +186,7 @@ def _by_box(candidates, pixels, boxes):  # type: ignore[no-untyped-def]
     return candidates[hits], pixels[hits], offsets
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _project_into(points, projection, near, boxes):  # type: ignore[no-untyped-def]
     """Indices and pixels of the points in the rectangle around all boxes.
 
@@ -227,7 +227,7 @@ def gaussian_mask(pixels: FloatArray, box: FloatArray) -> NDArray[np.float32]:
     return mask
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _gaussian(pixels, x1, y1, x2, y2):  # type: ignore[no-untyped-def]
     u, v, width, height = (x1 + x2) / 2, (y1 + y2) / 2, max(x2 - x1, 1e-6), max(y2 - y1, 1e-6)
     mask = np.empty(len(pixels), np.float32)
@@ -308,7 +308,7 @@ def _on_mask(found: Detections2D, detection: int, pixels: FloatArray, mask_mode:
     return instance.contains(pixels)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _turned(points, index, cos, sin):  # type: ignore[no-untyped-def]
     """Chosen points, turned counter-clockwise about the vertical axis by the angle of that cosine and sine."""
     turned = np.empty((len(index), points.shape[1]), np.float32)

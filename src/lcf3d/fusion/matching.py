@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
-from numba import njit
 
 from lcf3d.fusion.clustering import Clusters
 from lcf3d.geometry.camera import project_boxes
 from lcf3d.geometry.iou import image_iou
+from lcf3d.kernels import kernel
 from lcf3d.structures import BoolArray, Camera, Detections3D, FloatArray, IntArray
 
 Assignment = Literal["gated", "paper"]
@@ -62,7 +62,7 @@ def cluster_iou(projected: FloatArray, visible: BoolArray, clusters: Clusters, b
     return result
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _fill_cluster_iou(projected, visible, cluster_of_box, boxes2d, result):  # type: ignore[no-untyped-def]
     """Raise ``result`` (C, M) to the IoU of each visible member of each cluster with each 2D box."""
     for i in range(len(projected)):

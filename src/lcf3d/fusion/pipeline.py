@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -40,6 +40,8 @@ class LateCascadeFusion:
         localizer: puts boxes into frustums; the geometric one if not given.
         calibration: what the detectors' scores mean, see `lcf3d.fusion.calibration`; scores are taken as they are if
             not given, and must then lie in [0, 1].
+        reports: the classes that the detector of each camera can report; cameras left out can report all. A box of
+            another class is not judged by a camera: not seeing it there means nothing.
 
     Example:
         >>> fusion = LateCascadeFusion(FusionConfig.preset("kitti"))  # doctest: +SKIP
@@ -52,7 +54,9 @@ class LateCascadeFusion:
         config: FusionConfig | None = None,
         localizer: Localizer | None = None,
         calibration: Calibration | None = None,
+        reports: Mapping[str, Collection[str]] | None = None,
     ) -> None:
+        self.reports = dict(reports or {})
         self.config = config or FusionConfig()
         unknown = unknown_classes(self.config.class_names)
         if unknown and self.config.ensemble == "evidence":
@@ -97,8 +101,10 @@ class LateCascadeFusion:
         branches = self._prepare(frame, lidar, camera)
         clusters, views, matches = self._match(branches)
         box = choose_representatives(branches, clusters, matches, self.config)
-        weighed = gather_evidence(box, branches, views, matches, self.config, self.calibration)
-        used = weighed.agreed & matches.visible & self._detectable(branches, box)
+        weighed = gather_evidence(
+            box, branches, self._judging(branches, views, box), matches, self.config, self.calibration
+        )
+        used = weighed.agreed & matches.visible & self._detectable(branches, box, views)
         return weighed._replace(box=branches.lidar_index[box], agreed=used)
 
     def _prepare(self, frame: Frame, lidar: Detections3D, camera: Mapping[str, Detections2D]) -> Branches:
@@ -106,10 +112,40 @@ class LateCascadeFusion:
         probable = {name: self.calibration.calibrate_camera(found) for name, found in camera.items()}
         return prepare_branches(frame, self.calibration.calibrate_lidar(lidar), probable, self.config)
 
-    def _detectable(self, branches: Branches, boxes: IntArray) -> BoolArray:
-        """Which of some LiDAR boxes are of a class that the camera branch detects at all."""
+    def _detectable(
+        self, branches: Branches, boxes: IntArray, views: Sequence[View] = (), camera: str | None = None
+    ) -> BoolArray:
+        """Which of some LiDAR boxes, one a cluster, are of a class that the camera branch detects at all.
+
+        With ``views``: that some camera which looks at them can report. With ``camera``: that this camera can report.
+        """
+        labels = branches.lidar.labels[boxes]
         known = np.array([self.calibration.detects(name) for name in self.config.class_names])
-        return np.asarray(known[branches.lidar.labels[boxes]], dtype=bool)
+        detected = np.asarray(known[labels], dtype=bool)
+        if not self.reports:
+            return detected
+        if camera is not None:
+            return detected & self._reported(camera)[labels]
+        judged = [
+            view.visible & self._reported(one.name)[labels] for view, one in zip(views, branches.cameras, strict=True)
+        ]
+        return detected & np.any(judged, axis=0) if judged else detected
+
+    def _judging(self, branches: Branches, views: Sequence[View], boxes: IntArray) -> list[View]:
+        """The views, each blind to boxes of classes that its camera cannot report."""
+        if not self.reports:
+            return list(views)
+        labels = branches.lidar.labels[boxes]
+        return [
+            view._replace(visible=view.visible & self._reported(camera.name)[labels])
+            for view, camera in zip(views, branches.cameras, strict=True)
+        ]
+
+    def _reported(self, camera: str) -> BoolArray:
+        """(classes,) whether the detector of a camera can report each class."""
+        names = self.config.class_names
+        reported = self.reports.get(camera, names)
+        return np.array([name in reported for name in names], dtype=bool)
 
     def _decide(
         self, branches: Branches, clusters: Clusters, views: Sequence[View], matches: Matches
@@ -118,9 +154,11 @@ class LateCascadeFusion:
         box = choose_representatives(branches, clusters, matches, self.config)
         scores = None
         if self.config.ensemble == "evidence":
-            weighed = gather_evidence(box, branches, views, matches, self.config, self.calibration)
+            weighed = gather_evidence(
+                box, branches, self._judging(branches, views, box), matches, self.config, self.calibration
+            )
             scores = fused_scores(weighed, self.config, self.calibration)
-        return decide_clusters(box, branches, matches, self.config, self._detectable(branches, box), scores)
+        return decide_clusters(box, branches, matches, self.config, self._detectable(branches, box, views), scores)
 
     def _match(self, branches: Branches) -> tuple[Clusters, list[View], Matches]:
         """Bounding box matching (section 4.1.3): cluster once, match per camera, merge."""
@@ -141,20 +179,20 @@ class LateCascadeFusion:
                 found.boxes,
                 iou_threshold=config.match_iou,
                 method="paper" if config.assignment == "paper" else "gated",
-                rounds=self._rounds(branches, clusters, found),
+                rounds=self._rounds(branches, clusters, found, camera.name),
             )
             for camera, found in zip(branches.cameras, branches.camera, strict=True)
         ]
         return clusters, views, merge_views(views, len(clusters))
 
-    def _rounds(self, branches: Branches, clusters: Clusters, found: Detections2D) -> list[BoolArray]:
+    def _rounds(self, branches: Branches, clusters: Clusters, found: Detections2D, camera: str) -> list[BoolArray]:
         """Which pairs of clusters and 2D detections may match, by round of assignment; empty for all at once.
 
         Clusters of a class that the camera branch does not detect match nothing. With ``class_first`` pairs of equal
         class go first; of the others only decisive detections, which may change a label.
         """
         boxes = clusters.representative
-        judged = np.broadcast_to(self._detectable(branches, boxes)[:, None], (len(boxes), len(found)))
+        judged = np.broadcast_to(self._detectable(branches, boxes, camera=camera)[:, None], (len(boxes), len(found)))
         if self.config.assignment != "class_first":
             return [] if judged.all() else [judged]
         equal = branches.lidar.labels[boxes][:, None] == found.labels[None]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from lcf3d.errors import ConfigError
@@ -15,6 +14,7 @@ from lcf3d.geometry.lens import (
     lens_numbers,
     project_through_lens,
 )
+from lcf3d.kernels import kernel
 from lcf3d.structures import BoolArray, Camera, FloatArray
 
 
@@ -36,7 +36,7 @@ def project_points(points: NDArray[np.floating], camera: Camera) -> tuple[FloatA
     return pixels, depths
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _bound_projections(corners, edges, projection, near, bounds):  # type: ignore[no-untyped-def]
     """Fill ``bounds`` (N, 4) with the extent of each box's projection in front of the near plane, inf where none."""
     homogeneous = np.empty((8, 3))

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from lcf3d.errors import ShapeError
+from lcf3d.kernels import kernel
 from lcf3d.structures import FloatArray
 
 CELL = 2.0
@@ -24,7 +24,7 @@ FIELD_STEP = 4.0
 FIELD_RADIUS = 8.0
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def ordered(values):  # type: ignore[no-untyped-def]
     """A sorted copy of a short array (numba); one compiled sort serves all of the localizer."""
     result = values.copy()
@@ -37,7 +37,7 @@ def ordered(values):  # type: ignore[no-untyped-def]
     return result
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def lowest_returns(cloud):  # type: ignore[no-untyped-def]
     """Lowest point in each cell of a grid around the sensor (numba).
 
@@ -61,7 +61,7 @@ def lowest_returns(cloud):  # type: ignore[no-untyped-def]
     return grid
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def fit_plane(grid, x, y, radius, plane):  # type: ignore[no-untyped-def]
     """Ground plane around a place, by least squares that believes low points and distrusts high ones (numba).
 
@@ -99,7 +99,7 @@ def fit_plane(grid, x, y, radius, plane):  # type: ignore[no-untyped-def]
         _solve_plane(cells, n, scale, SLOPE_BELIEF * 0.25 * radius * radius, expected, plane)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _solve_plane(cells, n, scale, slope_belief, expected, plane):  # type: ignore[no-untyped-def]
     """One step of the reweighted least squares of `fit_plane`, from ``plane`` to ``plane``."""
     sw = su = sv = sz = suv = 0.0
@@ -174,7 +174,7 @@ def ground_field(points: NDArray[np.floating], area: tuple[float, float, float, 
     return GroundField(low, _fit_nodes(grid, low, counts, expected))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _fit_nodes(grid, low, counts, expected):  # type: ignore[no-untyped-def]
     """(I, J, 3) planes at the nodes, each expected to go on from the node beside it that is nearer the sensor."""
     planes = np.empty((counts[0], counts[1], 3))
@@ -197,7 +197,7 @@ def _fit_nodes(grid, low, counts, expected):  # type: ignore[no-untyped-def]
     return planes
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _blend(places, low, planes):  # type: ignore[no-untyped-def]
     """See `GroundField.heights`."""
     heights = np.empty(len(places))

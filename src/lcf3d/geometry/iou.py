@@ -10,8 +10,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from lcf3d.kernels import kernel
 from lcf3d.structures import FloatArray
 
 
@@ -33,7 +33,7 @@ def image_area(boxes: FloatArray) -> FloatArray:
     return area
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _clipped_edge_integral(xa, ya, xb, yb, half_length, half_width):  # type: ignore[no-untyped-def]
     """Integral of clip(y, +-half_width) dx along the edge a -> b, x clipped to +-half_length."""
     dx = xb - xa
@@ -60,7 +60,7 @@ def _clipped_edge_integral(xa, ya, xb, yb, half_length, half_width):  # type: ig
     return (x1 - x0) * mean
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def turned_intersection(ax, ay, a_length, a_width, cos_a, sin_a, bx, by, b_length, b_width, cos_b, sin_b):  # type: ignore[no-untyped-def]
     """Area that two rotated rectangles share, from cosine and sine of their yaws (scalars; numba)."""
     dx, dy = bx - ax, by - ay
@@ -85,7 +85,7 @@ def turned_intersection(ax, ay, a_length, a_width, cos_a, sin_a, bx, by, b_lengt
     return min(area, a_length * a_width, b_length * b_width) if area > 0.0 else 0.0
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def bev_intersection(ax, ay, a_length, a_width, a_yaw, bx, by, b_length, b_width, b_yaw):  # type: ignore[no-untyped-def]
     """Area that two rotated rectangles share (scalars; numba)."""
     return turned_intersection(
@@ -104,7 +104,7 @@ def bev_intersection(ax, ay, a_length, a_width, a_yaw, bx, by, b_length, b_width
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def pair_bev_iou(a, b):  # type: ignore[no-untyped-def]
     """Bird's-eye-view IoU of two canonical boxes (7,) (numba)."""
     shared = bev_intersection(a[0], a[1], a[3], a[4], a[6], b[0], b[1], b[3], b[4], b[6])
@@ -112,7 +112,7 @@ def pair_bev_iou(a, b):  # type: ignore[no-untyped-def]
     return shared / union if union > 0.0 else 0.0
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def pair_iou_3d(a, b):  # type: ignore[no-untyped-def]
     """3D IoU of two canonical boxes (7,) (numba)."""
     height = min(a[2] + 0.5 * a[5], b[2] + 0.5 * b[5]) - max(a[2] - 0.5 * a[5], b[2] - 0.5 * b[5])
@@ -124,7 +124,7 @@ def pair_iou_3d(a, b):  # type: ignore[no-untyped-def]
     return shared / union if union > 0.0 else 0.0
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _iou_matrix(boxes_a, boxes_b, three_d):  # type: ignore[no-untyped-def]
     result = np.empty((len(boxes_a), len(boxes_b)))
     for i in range(len(boxes_a)):

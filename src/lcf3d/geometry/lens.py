@@ -10,11 +10,11 @@ import math
 from functools import lru_cache
 
 import numpy as np
-from numba import njit
 
 from lcf3d.distortion import Distortion, Field
 from lcf3d.errors import ConfigError
 from lcf3d.geometry.boxes import EDGES, box_corners
+from lcf3d.kernels import kernel
 from lcf3d.structures import BoolArray, Camera, FloatArray
 
 # nothing nearer to the camera than this is projected, in metres
@@ -48,7 +48,7 @@ def lens_numbers(camera: Camera) -> FloatArray:
     return numbers
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _pixel(x, y, z, n):  # type: ignore[no-untyped-def]
     """Pixel of a camera-coordinate direction inside the field (numba)."""
     k = n[COEFFICIENTS:]
@@ -69,7 +69,7 @@ def _pixel(x, y, z, n):  # type: ignore[no-untyped-def]
     return i[0] * a + i[1] * b + i[2], i[3] * b + i[4]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def project_through_lens(points, n, pixels, depths):  # type: ignore[no-untyped-def]
     """Fill ``pixels`` (N, 2), NaN outside the field, and ``depths`` (N,) of (N, 3 or more) points (numba)."""
     for p in range(len(points)):
@@ -85,13 +85,13 @@ def project_through_lens(points, n, pixels, depths):  # type: ignore[no-untyped-
             pixels[p, 0], pixels[p, 1] = np.nan, np.nan
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _unit(v, out):  # type: ignore[no-untyped-def]
     norm = max(math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2]), 1e-12)
     out[0], out[1], out[2] = v[0] / norm, v[1] / norm, v[2] / norm
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _edge_pixels(a, b, n, out):  # type: ignore[no-untyped-def]
     """Fill ``out`` (`PIECES` + 1, 2) with pixels along an edge, NaN outside of the field; returns how many, and cuts.
 
@@ -137,7 +137,7 @@ def _edge_pixels(a, b, n, out):  # type: ignore[no-untyped-def]
     return pieces + 1, cuts
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _positions(corners, n, out):  # type: ignore[no-untyped-def]
     """Fill ``out`` with the camera coordinates of (8, 3) corners."""
     for c in range(8):
@@ -147,7 +147,7 @@ def _positions(corners, n, out):  # type: ignore[no-untyped-def]
             )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def bound_through_lens(boxes, corners, edges, n, bounds):  # type: ignore[no-untyped-def]
     """Fill ``bounds`` (N, 4) with the extent of each box's image, inf where it has none (numba).
 
@@ -177,7 +177,7 @@ def bound_through_lens(boxes, corners, edges, n, bounds):  # type: ignore[no-unt
         bounds[k, 0], bounds[k, 1], bounds[k, 2], bounds[k, 3] = x1, y1, x2, y2
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _meets(box, x, y, z, n):  # type: ignore[no-untyped-def]
     """Whether the ray from the camera in a camera-coordinate direction meets a box."""
     # the camera and the direction in LiDAR coordinates: the left part of the rays' matrix is a rotation
@@ -200,7 +200,7 @@ def _meets(box, x, y, z, n):  # type: ignore[no-untyped-def]
     return enter < leave
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _all_edges(corners, edges, n, out):  # type: ignore[no-untyped-def]
     at = np.empty((8, 3))
     for k in range(len(corners)):

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from lcf3d.kernels import kernel
 from lcf3d.localizers.ground import station_of
 
 BIN = 0.25
@@ -25,7 +25,7 @@ MOST_POINTS = 64
 GAP_PER_METRE = 0.01
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def weigh_points(points, gaussian, planes, top, reaches, weights):  # type: ignore[no-untyped-def]
     """Ranges of a frustum's points, and how much each speaks for the object (numba).
 
@@ -50,7 +50,7 @@ def weigh_points(points, gaussian, planes, top, reaches, weights):  # type: igno
                 weights[i] = square * square
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def image_height_score(reach, ground, height, projection, image_size, box2d):  # type: ignore[no-untyped-def]
     """How well an upright object of known height, standing at a range on the frustum's axis, fills the 2D box (numba).
 
@@ -83,7 +83,7 @@ def image_height_score(reach, ground, height, projection, image_size, box2d):  #
     return PRIOR_FLOOR + (1.0 - PRIOR_FLOOR) * math.exp(-0.5 * square)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def range_profile(reaches, weights, window, planes, height, projection, image_size, box2d, profile):  # type: ignore[no-untyped-def]
     """Score of every range bin as the place where the object's near surface is (numba).
 
@@ -118,7 +118,7 @@ def range_profile(reaches, weights, window, planes, height, projection, image_si
         profile[b] = inside * prior
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def take_cluster(points, reaches, weights, low, high, gap, taken):  # type: ignore[no-untyped-def]
     """The heaviest connected group among the weighted points between two ranges (numba).
 
@@ -153,7 +153,7 @@ def take_cluster(points, reaches, weights, low, high, gap, taken):  # type: igno
     return kept, kept * stride
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _heaviest_component(taken, used, gap):  # type: ignore[no-untyped-def]
     """Move the heaviest component of the first ``used`` rows to the front; returns its size."""
     component = np.full(used, -1)

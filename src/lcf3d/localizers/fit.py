@@ -8,9 +8,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
 from lcf3d.geometry.ground import ordered
+from lcf3d.kernels import kernel
 
 PARAMETERS = 7
 X, Y, LIFT, LENGTH, WIDTH, HEIGHT, YAW = range(PARAMETERS)
@@ -53,7 +53,7 @@ SOLID = 30  # 1 where beams stop at the sides of the body
 EVIDENCE = 31
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def image_cost(q, evidence):  # type: ignore[no-untyped-def]
     """How far the edges of the projection, clipped to the image, are from those of the 2D box (numba).
 
@@ -88,12 +88,12 @@ def image_cost(q, evidence):  # type: ignore[no-untyped-def]
     return total + _robust((min(max(y2, 0.0), height) - box2d[3]) / down_sigma)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _robust(off):  # type: ignore[no-untyped-def]
     return off * off if abs(off) < 2.0 else 4.0 * abs(off) - 4.0
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def solid_cost(q, points):  # type: ignore[no-untyped-def]
     """Mean cost, 0 to 1, of points that are not on the visible sides of a closed body, seen from above (numba).
 
@@ -130,7 +130,7 @@ def solid_cost(q, points):  # type: ignore[no-untyped-def]
     return total / mass if mass > 0.0 else 1.0
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def open_cost(q, points):  # type: ignore[no-untyped-def]
     """Mean cost, 0 to 1, of points far from the middle of a body that beams enter, seen from above (numba)."""
     cos, sin = math.cos(q[YAW]), math.sin(q[YAW])
@@ -147,7 +147,7 @@ def open_cost(q, points):  # type: ignore[no-untyped-def]
     return total / mass if mass > 0.0 else 1.0
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def energy(q, points, evidence):  # type: ignore[no-untyped-def]
     """What a good fit makes small: disagreement with points, 2D box, class sizes and ground (numba)."""
     surface = solid_cost(q, points) if evidence[SOLID] > 0.0 else open_cost(q, points)
@@ -159,7 +159,7 @@ def energy(q, points, evidence):  # type: ignore[no-untyped-def]
     return total + 0.5 * min(off * off, 9.0)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def refine(q, rounds, points, evidence):  # type: ignore[no-untyped-def]
     """Pattern search, one parameter after the other, from ``q`` (changed in place); returns the energy reached."""
     step = np.empty(PARAMETERS)
@@ -189,7 +189,7 @@ def refine(q, rounds, points, evidence):  # type: ignore[no-untyped-def]
     return best
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def search(points, evidence):  # type: ignore[no-untyped-def]
     """The best box for the evidence (numba).
 
@@ -230,7 +230,7 @@ def search(points, evidence):  # type: ignore[no-untyped-def]
     return starts[best], refine(starts[best], LAST_ROUNDS, points, evidence)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _completed_centre(values, size):  # type: ignore[no-untyped-def]
     """Centre along one axis of a body of known size whose near side is seen; the third outermost points bound it."""
     order = ordered(values)
@@ -241,7 +241,7 @@ def _completed_centre(values, size):  # type: ignore[no-untyped-def]
     return low + 0.5 * size if low >= 0.0 else high - 0.5 * size
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _keep_best(energies, starts, value, q):  # type: ignore[no-untyped-def]
     """Enter ``q`` among the best starts."""
     place = 0

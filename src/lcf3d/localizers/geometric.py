@@ -9,12 +9,12 @@ import math
 from collections.abc import Mapping
 
 import numpy as np
-from numba import njit
 
 from lcf3d.fusion.frustum import FrustumProposals
 from lcf3d.geometry.boxes import wrap_angle
 from lcf3d.geometry.ground import fit_plane, lowest_returns
 from lcf3d.geometry.lens import local_projection
+from lcf3d.kernels import kernel
 from lcf3d.localizers.cluster import BIN, BINS, GAP_PER_METRE, MOST_POINTS, range_profile, take_cluster, weigh_points
 from lcf3d.localizers.fit import (
     BOX2D,
@@ -141,7 +141,7 @@ def _row(shape: ObjectShape | None) -> list[float]:
     ]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _localize_all(  # type: ignore[no-untyped-def]
     points, gaussian, offsets, axis_yaw, boxes2d, projections, image_sizes, rows, grid, boxes, quality
 ):
@@ -164,7 +164,7 @@ def _localize_all(  # type: ignore[no-untyped-def]
         quality[k] = _localize_one(part, weight, rows[k], planes, projections[k], evidence, boxes[k])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _localize_one(points, gaussian, row, planes, projection, evidence, box):  # type: ignore[no-untyped-def]
     """Fill ``box`` (7,) with the best fit to any of the proposal's depth clusters; returns its quality."""
     reaches, weights, profile = np.empty(len(points)), np.empty(len(points)), np.empty(BINS)
@@ -204,7 +204,7 @@ def _localize_one(points, gaussian, row, planes, projection, evidence, box):  # 
     return quality
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _set_size(row, near, plane, projection, evidence):  # type: ignore[no-untyped-def]
     """Enter the sizes of the class, or of the 2D box at that range if unknown; returns whether the body is solid."""
     wide, tall = evidence[BOX2D + 2] - evidence[BOX2D], evidence[BOX2D + 3] - evidence[BOX2D + 1]
@@ -226,7 +226,7 @@ def _set_size(row, near, plane, projection, evidence):  # type: ignore[no-untype
     return solid
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _quality(q, points, evidence, count):  # type: ignore[no-untyped-def]
     surface = solid_cost(q, points) if evidence[SOLID] > 0.0 else open_cost(q, points)
     return (1.0 - surface) * math.exp(-0.1 * image_cost(q, evidence)) * math.sqrt(min(1.0, count / FULL_COUNT))

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
 from lcf3d.geometry.ground import fit_plane
+from lcf3d.kernels import kernel
 
 # cells around a place that take part in its plane
 RADIUS = 10.0
@@ -17,7 +17,7 @@ FIRST_STATION = 4.0
 STATION_STEP = 1.5
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def ground_along(grid, yaw, expected, planes):  # type: ignore[no-untyped-def]
     """Ground planes along the ray of heading ``yaw``, each expected to go on from the last (numba).
 
@@ -37,7 +37,7 @@ def ground_along(grid, yaw, expected, planes):  # type: ignore[no-untyped-def]
         before = reach
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def station_of(reach):  # type: ignore[no-untyped-def]
     """Row of `ground_along` for a range in metres."""
     s, limit = 0, FIRST_STATION * math.sqrt(STATION_STEP)

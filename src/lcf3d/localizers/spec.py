@@ -92,7 +92,7 @@ class LocalizerSpec:
             values = json.loads(text)
             templates = tuple(tuple(float(v) for v in row) for row in values.pop("templates"))
             spec = cls(class_names=tuple(values.pop("class_names")), templates=templates, **values)  # type: ignore[arg-type]
-        except (ValueError, TypeError, KeyError, AttributeError) as error:
+        except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError) as error:
             raise ConfigError(f"not the configuration of a frustum network: {error}") from None
         if spec.version != 1:
             raise ConfigError(f"a frustum network of version {spec.version}; this lcf3d reads version 1: update lcf3d")

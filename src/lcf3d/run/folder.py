@@ -15,8 +15,9 @@ from typing import Any
 
 from lcf3d.datasets.base import ResultWriter
 from lcf3d.errors import ConfigError
-from lcf3d.files import read_json, write_json
+from lcf3d.files import inside, list_files, read_json, read_text, reading, remove_left_overs, write_json
 from lcf3d.fusion.config import FusionConfig
+from lcf3d.processes import lock_folder, unlock_folder
 from lcf3d.provenance import FusedDetections
 from lcf3d.structures import Frame
 
@@ -53,7 +54,7 @@ class RunFolder:
 
     def provenance_path(self, frame_id: str) -> Path:
         """The provenance file of a frame."""
-        return self.path / "provenance" / f"{frame_id}.json"
+        return inside(self.path / "provenance", frame_id, ".json")
 
     def request(self) -> dict[str, Any]:
         """What was run, as ``run.json`` has it.
@@ -66,7 +67,7 @@ class RunFolder:
         if not isinstance(content, dict):
             raise ConfigError(f"{self.path / 'run.json'} does not say what was run")
         version = content.get("format", 1)
-        if not isinstance(version, int) or version > FORMAT:
+        if not isinstance(version, int) or not 1 <= version <= FORMAT:
             raise ConfigError(
                 f"{self.path} is a run of format {version}, written by lcf3d {content.get('lcf3d', '?')}; this lcf3d "
                 f"reads formats up to {FORMAT}: upgrade it"
@@ -81,14 +82,37 @@ class RunFolder:
                 other settings or inputs.
         """
         run = {"format": FORMAT, **run}
-        settings, inputs = self.path / "config.yaml", self.path / "run.json"
+        self.lock()
+        try:
+            self._begin(config, run, resume=resume, overwrite=overwrite)
+        except BaseException:
+            self.release()
+            raise
+
+    def lock(self) -> None:
+        """Keep other processes from writing into the folder until `release`, or until this process ends.
+
+        Raises:
+            ConfigError: another process is writing; says which. Or the folder is a file.
+        """
         if self.path.is_file():
             raise ConfigError(f"{self.path} is a file; choose a folder for --out")
-        occupied = self.path.is_dir() and any(self.path.iterdir())
+        lock_folder(self.path)
+
+    def release(self) -> None:
+        """Let others write again."""
+        unlock_folder(self.path)
+
+    def _begin(self, config: FusionConfig, run: dict[str, Any], *, resume: bool, overwrite: bool) -> None:
+        """See `begin`, with the folder locked."""
+        remove_left_overs(self.path)
+        settings, inputs = self.path / "config.yaml", self.path / "run.json"
+        occupied = bool(list_files(self.path))
         if occupied and not overwrite:
             if not resume:
                 raise ConfigError(f"{self.path} is not empty; pass --resume, --overwrite or another --out")
-            same = settings.is_file() and settings.read_text(encoding="utf-8") == config.to_yaml()
+            # a run that was killed before it had written its settings
+            same = not settings.is_file() or read_text(settings) == config.to_yaml()
             if not same or not inputs.is_file() or read_json(inputs) != run:
                 raise ConfigError(
                     f"{self.path} holds a run with other settings or inputs, so it cannot be resumed; "
@@ -97,15 +121,22 @@ class RunFolder:
         elif occupied:
             if not inputs.is_file():
                 raise ConfigError(f"{self.path} holds files of something else; choose another --out")
-            results = () if self._writer is None else self._writer.written()
-            for file in (*results, *self.path.glob("provenance/*.json"), self.calibration_path, self.alignment_path):
+            for file in self._own_files():
                 file.unlink(missing_ok=True)
         write_json(inputs, run)
         config.dump(settings)
 
+    def _own_files(self) -> list[Path]:
+        """What the run that the folder holds has written, but for what lies behind a link or is of no frame of it."""
+        frames = set(self.frame_ids())
+        results = [] if self._writer is None else list(self._writer.written())
+        own = [file for file in results if file.parent == self.path or file.stem in frames]
+        own += [*(self.provenance_path(frame_id) for frame_id in frames), self.calibration_path, self.alignment_path]
+        return [file for file in own if not _behind_link(file, self.path)]
+
     def frame_ids(self) -> list[str]:
         """Frames that are done, sorted."""
-        return sorted(path.stem for path in (self.path / "provenance").glob("[!.]*.json"))
+        return [path.stem for path in list_files(self.path / "provenance", ".json")]
 
     def is_done(self, frame_id: str) -> bool:
         """Whether the files of a frame are there."""
@@ -119,9 +150,10 @@ class RunFolder:
             self._writer.write(frame, fused)
 
     def finish(self, frame_ids: Sequence[str]) -> None:
-        """Write what belongs to all frames together."""
+        """Write what belongs to all frames together, and let others write again."""
         if self._writer is not None:
             self._writer.finish(frame_ids, self.read)
+        self.release()
 
     def read(self, frame_id: str) -> FusedDetections:
         """The result of a frame with its provenance.
@@ -129,4 +161,11 @@ class RunFolder:
         Raises:
             FormatError: it is not there or not readable.
         """
-        return FusedDetections.from_json(read_json(self.provenance_path(frame_id)))
+        path = self.provenance_path(frame_id)
+        with reading(path, "the provenance of a frame"):
+            return FusedDetections.from_json(read_json(path))
+
+
+def _behind_link(file: Path, folder: Path) -> bool:
+    """Whether a file, or a folder on the way to it from ``folder``, is a link."""
+    return any(path.is_symlink() for path in (file, *file.parents) if path != folder and folder in path.parents)

@@ -17,6 +17,7 @@ from lcf3d.fusion.memory import remember
 from lcf3d.fusion.memory_config import MemoryConfig
 from lcf3d.fusion.memory_smooth import smooth_sequence
 from lcf3d.fusion.memory_state import Memory
+from lcf3d.processes import end_with_parent, workers
 from lcf3d.provenance import FusedDetections, Outcome, Reason
 from lcf3d.run.alignment import aligned_frame
 from lcf3d.run.folder import RunFolder
@@ -176,6 +177,7 @@ _worker: FrameRunner
 def _start_worker(runner: FrameRunner) -> None:
     global _worker
     _worker = runner
+    end_with_parent()
 
 
 def _work(frame_ids: Sequence[str]) -> list[FrameSummary]:
@@ -204,8 +206,9 @@ def run_frames(
     context = get_context("fork")
     with ProcessPoolExecutor(jobs, mp_context=context, initializer=_start_worker, initargs=(runner,)) as pool:
         try:
-            for done in pool.map(_work, sequences):
-                yield from done
+            with workers("fusing: the frames that are done are kept, go on with --resume and fewer --jobs"):
+                for done in pool.map(_work, sequences):
+                    yield from done
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise

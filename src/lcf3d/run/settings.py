@@ -8,7 +8,8 @@ from typing import Any
 
 import yaml
 
-from lcf3d.errors import ConfigError
+from lcf3d.errors import ConfigError, FormatError
+from lcf3d.files import reading, shortened
 from lcf3d.fusion.config import FusionConfig
 from lcf3d.fusion.stereo import StereoConfig
 
@@ -33,7 +34,8 @@ def build_config(
         if not equals:
             raise ConfigError(f"--set takes name=value, got {item!r}")
         try:
-            values[name] = yaml.safe_load(text)
-        except yaml.YAMLError:
-            raise ConfigError(f"--set {name} cannot be read as a value: {text!r}") from None
+            with reading(f"--set {name}", "a value"):
+                values[name] = yaml.safe_load(text)
+        except FormatError:
+            raise ConfigError(f"--set {name} cannot be read as a value: {shortened(text)!r}") from None
     return config.updated(**values) if values else config

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -24,6 +24,7 @@ from lcf3d.localizers.named import load_localizer
 from lcf3d.run.alignment import aligned_frame, describe, find_alignment
 from lcf3d.run.folder import RunFolder
 from lcf3d.run.frames import FrameRunner
+from lcf3d.run.joins import FEW_FRAMES, left_out_counts, left_out_notes, report_notes, reported_classes
 from lcf3d.run.settings import build_config
 from lcf3d.run.sources import CameraOnImages, DetectorOnFrames, LidarOnScans, open_cameras, open_lidar
 
@@ -33,8 +34,6 @@ log = logging.getLogger(__name__)
 TEACHING_FRAMES = 400
 # the same where a camera detector has to be run on them
 TEACHING_IMAGES = 40
-# with fewer frames than this, a class that the camera branch did not detect may just not have been there
-FEW_FRAMES = 100
 
 
 @dataclass(frozen=True)
@@ -91,13 +90,23 @@ class Inputs(NamedTuple):
 
 @dataclass(frozen=True)
 class Run:
-    """A run ready to begin."""
+    """A run ready to begin.
+
+    Attributes:
+        dataset: whose frames they are.
+        frame_ids: the frames.
+        config: settings.
+        runner: what to do with a frame.
+        folder: where results go.
+        notes: what of the inputs is left out, and which classes no camera is asked about; once a run.
+    """
 
     dataset: Dataset
     frame_ids: tuple[str, ...]
     config: FusionConfig
     runner: FrameRunner
     folder: RunFolder
+    notes: tuple[str, ...] = ()
 
 
 def prepare_run(
@@ -140,7 +149,14 @@ def prepare_run(
         require = getattr(source, "require_probabilities", None)
         if require is not None:
             require(getattr(calibration, maps) if calibration else ())
-    written: dict[str, Any] = {"lcf3d": __version__, **asdict(request)}
+    reported = reported_classes(cameras, config, len(frame_ids))
+    notes = (*left_out_notes(lidar, cameras), *report_notes(reported, config))
+    written: dict[str, Any] = {
+        "lcf3d": __version__,
+        **asdict(request),
+        "left_out": left_out_counts(lidar, cameras),
+        "notes": list(notes),
+    }
     folder.begin(config, _as_json(written), resume=resume, overwrite=overwrite)
     if reports:
         write_json(folder.alignment_path, {name: whole.to_json() for name, (whole, *_) in reports.items()})
@@ -148,8 +164,8 @@ def prepare_run(
             log.warning("camera %s: %s (%s)", name, describe(whole), whole.status)
     if calibration is not None:
         calibration.dump(folder.calibration_path)
-        runner.fusion = make_fusion(config, localizer, calibration)
-    return Run(dataset, frame_ids, config, runner, folder)
+    runner.fusion = make_fusion(config, localizer, calibration, reported)
+    return Run(dataset, frame_ids, config, runner, folder, notes)
 
 
 def read_inputs(
@@ -238,12 +254,15 @@ def _require_images(dataset: Dataset, frame_ids: Sequence[str], cameras: dict[st
 
 
 def make_fusion(
-    config: FusionConfig, localizer: Localizer, calibration: Calibration | None = None
+    config: FusionConfig,
+    localizer: Localizer,
+    calibration: Calibration | None = None,
+    reports: Mapping[str, Collection[str]] | None = None,
 ) -> LateCascadeFusion:
     """The fusion that belongs to some settings: that of stereo pairs for `StereoConfig`."""
     if isinstance(config, StereoConfig):
-        return StereoLateCascadeFusion(config, localizer, calibration=calibration)
-    return LateCascadeFusion(config, localizer, calibration=calibration)
+        return StereoLateCascadeFusion(config, localizer, calibration=calibration, reports=reports)
+    return LateCascadeFusion(config, localizer, calibration=calibration, reports=reports)
 
 
 def find_calibration(

@@ -51,10 +51,16 @@ class DetectorOnFrames:
 
 
 class CameraOnImages:
-    """A camera detector, run on the frames' images."""
+    """A camera detector, run on the frames' images.
+
+    Attributes:
+        detector: the detector.
+        reports: the classes that it can report, None where it does not say.
+    """
 
     def __init__(self, detector: CameraDetector) -> None:
         self.detector = detector
+        self.reports: tuple[str, ...] | None = getattr(detector, "reports", None)
 
     def sees(self, frame: Frame, camera: str) -> bool:
         """Whether there is an image."""

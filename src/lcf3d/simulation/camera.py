@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from lcf3d.geometry.camera import pixel_rays, pixels_in_field
 from lcf3d.geometry.epipolar import camera_centre
+from lcf3d.kernels import kernel
 from lcf3d.simulation.light import Light
 from lcf3d.simulation.materials import camera_table
 from lcf3d.simulation.meshes.primitives import Mesh
@@ -285,7 +285,7 @@ def _around(normal: Floats, local: Floats) -> Floats:
     return result
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def spread_openness(blocked, distance, normal, full, out):  # type: ignore[no-untyped-def]
     """Average half-resolution samples over 8 x 8 neighbours on the same surface, and bring them to full resolution."""
     h, w = blocked.shape
@@ -317,7 +317,7 @@ def spread_openness(blocked, distance, normal, full, out):  # type: ignore[no-un
             out[i, j] = value
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def find_edges(triangle, material, owner, normal, depth):  # type: ignore[no-untyped-def]
     """(H, W) bool: pixels whose right or lower neighbour is another surface, and those neighbours."""
     h, w = triangle.shape

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from lcf3d.datasets.kitti import KittiDataset, read_points
 from lcf3d.errors import DatasetError, MissingExtraError
+from lcf3d.files import list_files
 from lcf3d.formats.kitti import KittiObjects, read_folder
 from lcf3d.geometry.boxes import lidar_from_kitti, points_in_boxes
 from lcf3d.structures import FloatArray
@@ -114,7 +115,7 @@ def _count_points(
 def label_statistics(root: Path, ids: Sequence[str] | None = None) -> LabelStatistics:
     """Statistics of the label files of a KITTI-layout folder."""
     folder = root / "training" / "label_2"
-    chosen = list(ids) if ids is not None else sorted(p.stem for p in folder.glob("*.txt"))
+    chosen = list(ids) if ids is not None else [p.stem for p in list_files(folder, ".txt")]
     frames = [read_folder(folder, [i], results=False)[0] for i in chosen]
     every = KittiObjects(
         *(

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from lcf3d.kernels import kernel
 from lcf3d.simulation.camera import Stage
 from lcf3d.simulation.materials import lidar_table
 from lcf3d.simulation.patterns import facade, road_mark
@@ -157,7 +157,7 @@ def _droplets(
     measured[chosen], intensity[chosen], kept[chosen], owner[chosen] = near[first], 0.02, True, 0
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def reflect(  # type: ignore[no-untyped-def]
     triangle,
     distance,

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from lcf3d.kernels import kernel
 from lcf3d.simulation.meshes.primitives import Mesh
 from lcf3d.simulation.roads import Terrain
 
@@ -60,7 +60,7 @@ def _extremes(values: NDArray[np.floating]) -> tuple[NDArray[np.floating], NDArr
     return np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def mark_cells(corners, ground, x0, y0, cell, lowest, highest, taken):  # type: ignore[no-untyped-def]
     """Mark the cells below points sampled densely on (T, 3, 3) triangles, between two heights above ``ground`` (T,)."""
     for t in range(len(corners)):

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
-
+from lcf3d.kernels import kernel
 from lcf3d.simulation.textures import LEVEL_OFFSET, LEVELS, SIZE
 
 _OFFSETS = tuple(int(v) for v in LEVEL_OFFSET)
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _hash(a, b):  # type: ignore[no-untyped-def]
     """A number in [0, 1) for a pair of integers."""
     h = (a * 374761393 + b * 668265263) & 0xFFFFFFFF
@@ -19,7 +18,7 @@ def _hash(a, b):  # type: ignore[no-untyped-def]
     return ((h ^ (h >> 16)) & 0xFFFFFF) / 16777216.0
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def value_noise(x, y):  # type: ignore[no-untyped-def]
     """Smooth noise in [0, 1) with cells of size 1."""
     ix, iy = math.floor(x), math.floor(y)
@@ -30,7 +29,7 @@ def value_noise(x, y):  # type: ignore[no-untyped-def]
     return low * (1 - fy) + high * fy
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def sample(textures, texture, x, y, texels, albedo):  # type: ignore[no-untyped-def]
     """Multiply ``albedo`` by a texture at tile coordinates; ``texels`` is the width of the pixel on the texture."""
     level = 0
@@ -51,14 +50,14 @@ def sample(textures, texture, x, y, texels, albedo):  # type: ignore[no-untyped-
         albedo[k] *= low * (1 - fy) + high * fy
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _band(x, half, blur):  # type: ignore[no-untyped-def]
     """Coverage of a line of half width ``half`` at distance ``x``, seen with a pixel ``blur`` wide."""
     edge = max(blur, 0.01)
     return min(max((half - x) / edge + 0.5, 0.0), 1.0) * min(1.0, 2 * half / edge)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def road_mark(s, t, road, blur):  # type: ignore[no-untyped-def]
     """Share of paint, 0 to 1, at arc length ``s`` and offset ``t`` of the road described by ``road``.
 
@@ -99,7 +98,7 @@ def road_mark(s, t, road, blur):  # type: ignore[no-untyped-def]
     return paint * 0.9
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def facade(x, y, seed, blur, night, albedo):  # type: ignore[no-untyped-def]
     """Windows, doors and shops on a wall whose cells are one unit wide and high; changes ``albedo`` in place.
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from lcf3d.kernels import kernel
 from lcf3d.simulation.light import SKY_HEIGHT, SKY_WIDTH
 from lcf3d.simulation.patterns import facade, road_mark, sample, value_noise
 from lcf3d.simulation.textures import SIZE
@@ -14,7 +14,7 @@ from lcf3d.simulation.textures import SIZE
 _HALF_PI = math.pi / 2
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _sky(sky, x, y, z, out):  # type: ignore[no-untyped-def]
     """Radiance of the sky in a direction, into ``out``."""
     row = math.asin(min(max(z, 0.0), 1.0)) / _HALF_PI * SKY_HEIGHT - 0.5
@@ -31,7 +31,7 @@ def _sky(sky, x, y, z, out):  # type: ignore[no-untyped-def]
         out[k] = low * (1 - fr) + high * fr
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _mirror(sky, light, x, y, z, out):  # type: ignore[no-untyped-def]
     """What is seen in a mirror that looks that way: sky, a dim row of houses at the horizon, or the road."""
     azimuth = math.atan2(y, x)
@@ -47,7 +47,7 @@ def _mirror(sky, light, x, y, z, out):  # type: ignore[no-untyped-def]
         out[k] = out[k] * above + low * (1 - above) if above > 0 else low
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def locate(triangle, u, v, distance, direction, origin, corners, normals, sun, position, normal, towards_sun):  # type: ignore[no-untyped-def]
     """World position and shading normal of N hits; returns how many of them can see the sun at all.
 
@@ -93,7 +93,7 @@ def locate(triangle, u, v, distance, direction, origin, corners, normals, sun, p
     return count
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def shade(  # type: ignore[no-untyped-def]
     triangle,
     u,
@@ -198,7 +198,7 @@ def shade(  # type: ignore[no-untyped-def]
             out[i, k] = out[i, k] * (1 - far) + light[12 + k] * far
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _ground(textures, texture, tile, x, y, dx, dy, small, large, albedo):  # type: ignore[no-untyped-def]
     """Texture of a horizontal surface by world position, filtered along the view, with large-scale variation."""
     flat = math.sqrt(dx * dx + dy * dy) + 1e-9
@@ -224,7 +224,7 @@ def _ground(textures, texture, tile, x, y, dx, dy, small, large, albedo):  # typ
     albedo[0], albedo[1], albedo[2] = red / taps * broad, green / taps * broad, blue / taps * broad
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _carriageway(textures, texture, road, s, t, small, large, dx, dy, albedo, specular):  # type: ignore[no-untyped-def]
     """Wheel tracks, repairs and painted lines on the road; returns its mirror share."""
     half = road[0] - road[5]
@@ -248,7 +248,7 @@ def _carriageway(textures, texture, road, s, t, small, large, dx, dy, albedo, sp
     return specular
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _light_surface(  # type: ignore[no-untyped-def]
     kind,
     albedo,
@@ -304,7 +304,7 @@ def _light_surface(  # type: ignore[no-untyped-def]
             out[k] += albedo[k] * 2.2
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _lamps(px, py, pz, nx, ny, nz, light):  # type: ignore[no-untyped-def]
     """Light from the car's headlamps and the street lamps at night."""
     if light[17] == 0:

@@ -12,7 +12,8 @@ from types import ModuleType
 from typing import Final
 
 from lcf3d.errors import ConfigError, DatasetError, MissingExtraError
-from lcf3d.files import read_json, write_json
+from lcf3d.files import list_files, read_json, remove_left_overs, write_json
+from lcf3d.processes import end_with_parent, lock_folder, unlock_folder, workers
 from lcf3d.simulation import kitti_layout, nuscenes_layout
 from lcf3d.simulation.frames import simulate_drive
 from lcf3d.simulation.presets import get_preset
@@ -114,6 +115,7 @@ def write_dataset(
             nuscenes_layout.write_tables(root, ids, recipe.seed)
     except OSError as error:
         raise _write_error(root, error) from error
+    unlock_folder(root)
     return ids
 
 
@@ -126,7 +128,9 @@ def _prepare(recipe: Recipe, root: Path, resume: bool) -> None:
     if root.exists() and not root.is_dir():
         raise ConfigError(f"{root} is a file; name a folder to write to")
     settings = root / SETTINGS_FILE
-    if root.is_dir() and any(root.iterdir()):
+    lock_folder(root)
+    remove_left_overs(root)
+    if list_files(root) or settings.is_file():
         if not resume:
             raise ConfigError(
                 f"{root} is not empty; choose another folder, or add --resume to complete a data set begun there"
@@ -190,7 +194,10 @@ def _in_processes(
 ) -> None:
     """Write the chunks in several processes; the first error stops the rest."""
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(jobs, len(chunks)), mp_context=context) as pool:
+    with (
+        workers("simulating: the frames that are done are kept, go on with --resume and fewer --jobs"),
+        ProcessPoolExecutor(min(jobs, len(chunks)), mp_context=context, initializer=end_with_parent) as pool,
+    ):
         futures = [pool.submit(_write_frames, recipe, root, chunk, 1) for chunk in chunks]
         try:
             for future in as_completed(futures):

@@ -13,6 +13,7 @@ import numpy as np
 
 from lcf3d.detectors.lidar.config import LidarConfig
 from lcf3d.errors import FormatError
+from lcf3d.files import list_files
 from lcf3d.training.camera_appearance import Appearance, changed_look
 from lcf3d.training.camera_images import LabelledImage, from_sample
 from lcf3d.training.camera_store import DeviceViews, ImageStore, draw_views
@@ -61,12 +62,12 @@ class Arrivals:
 
     def held_out(self) -> list[Path]:
         """The held-out samples that are there."""
-        return [p for p in sorted(self.folder.glob("[!.]*.npz")) if is_held_out(p)]
+        return [p for p in list_files(self.folder, ".npz") if is_held_out(p)]
 
     def _read(self) -> None:
         seen: set[str] = set()
         while True:
-            new = [p for p in sorted(self.folder.glob("[!.]*.npz")) if p.name not in seen and not is_held_out(p)]
+            new = [p for p in list_files(self.folder, ".npz") if p.name not in seen and not is_held_out(p)]
             for path in new:
                 seen.add(path.name)
                 self._ready.extend(self.prepared([path]))

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from lcf3d.detectors.lidar.config import LidarConfig
+from lcf3d.kernels import kernel
 from lcf3d.structures import FloatArray, IntArray
 
 BOX_CHANNELS = 11
@@ -87,7 +87,7 @@ def center_targets(boxes: FloatArray, labels: IntArray, config: LidarConfig) -> 
     return CenterTargets(heat, counted, cells, values)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _warm(heat, owner, distance, k, x, y, sigma):  # type: ignore[no-untyped-def]
     """Add an object's heat around its own cell, and let it claim the cells next to it that are not nearer others."""
     height, width = heat.shape
@@ -103,7 +103,7 @@ def _warm(heat, owner, distance, k, x, y, sigma):  # type: ignore[no-untyped-def
                 distance[r, c] = -1.0 if own else away
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _blank(counted, x, y, half_length, half_width, yaw):  # type: ignore[no-untyped-def]
     """Leave the cells in and next to a box out of the loss."""
     height, width = counted.shape

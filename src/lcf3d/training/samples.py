@@ -15,13 +15,13 @@ from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
-from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lcf3d.errors import ConfigError, FormatError, MissingExtraError
-from lcf3d.files import atomic_path, read_json, write_json
+from lcf3d.files import atomic_path, read_json, reading, write_json
+from lcf3d.processes import end_with_parent, workers
 from lcf3d.structures import FloatArray, IntArray
 
 if TYPE_CHECKING:
@@ -138,7 +138,10 @@ def write_samples(
     if jobs == 1:
         _count(map(work, missing), progress)
         return paths
-    with ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn")) as pool:
+    with (
+        workers("making samples: those that are done are kept, go on with --resume and fewer --jobs"),
+        ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn"), initializer=end_with_parent) as pool,
+    ):
         futures = [pool.submit(work, index) for index in missing]
         try:
             _count((future.result() for future in as_they_end(futures)), progress)
@@ -249,7 +252,7 @@ def read_image(path: Path) -> ImageSample:
 
 def _read(path: Path, names: tuple[str, ...]) -> list[NDArray[Any]]:
     try:
-        with np.load(path, allow_pickle=False) as arrays:
+        with reading(path, "a training sample"), np.load(path, allow_pickle=False) as arrays:
             return [arrays[name] for name in names]
-    except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
+    except (OSError, FormatError) as error:
         raise FormatError(f"{path} is no training sample ({error}); remove it to have it simulated again") from error

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from lcf3d.detectors.base import Image
-from lcf3d.detectors.classes import to_classes
+from lcf3d.detectors.classes import reported_classes, to_classes
 from lcf3d.errors import ConfigError, DetectorError, Lcf3dError
 from lcf3d.structures import Detections2D
 
@@ -52,6 +52,7 @@ class MmdetDetector:
         self._infer = inference_detector
         self._own_classes = tuple(self._model.dataset_meta["classes"])
         self.class_names = self._own_classes if class_names is None else tuple(class_names)
+        self.reports = reported_classes(self._own_classes, self.class_names)
         self.score_threshold = score_threshold
 
     def __call__(self, images: Sequence[Image]) -> list[Detections2D]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,12 +13,15 @@ from numpy.typing import NDArray
 
 from lcf3d.detectors.base import Image
 from lcf3d.detectors.camera.onnx_images import instance_masks, prepare_image
-from lcf3d.detectors.camera.onnx_layouts import LAYOUTS, SIZES_INPUT, class_count, identify_layout
+from lcf3d.detectors.camera.onnx_layouts import LAYOUTS, SIZES_INPUT, class_count, identify_layout, tell_by_values
 from lcf3d.detectors.camera.tiling import merge_tiles, non_maximum_suppression, tile_spans
-from lcf3d.detectors.classes import COCO_CLASSES, read_class_names, to_classes
+from lcf3d.detectors.classes import COCO_CLASSES, read_class_names, reported_classes, to_classes
 from lcf3d.errors import ConfigError, DetectorError, ShapeError
+from lcf3d.files import shortened
 from lcf3d.networks.onnx import first_line, open_session
 from lcf3d.structures import KITTI_CLASSES, Detections2D
+
+log = logging.getLogger(__name__)
 
 # input side for networks that leave it open and do not record it either
 DEFAULT_SIZE = 640
@@ -78,9 +82,15 @@ class OnnxDetector:
         self._image_name: str = image_input.name
         self._dtype = _IMAGE_TYPES[image_input.type]
         self._size = self._input_size(image_input.shape[2:], size, metadata)
+        self._require_detector(image_input, metadata)
         shapes = self._output_shapes()
+        recorded = read_class_names(names) if names is not None else _metadata_names(metadata)
         try:
-            chosen = identify_layout(self._input_names(), shapes, self._size) if layout == "auto" else layout
+            chosen = layout
+            if layout == "auto":
+                chosen = identify_layout(self._input_names(), shapes, self._size, len(recorded or ()) or None)
+            if "/" in chosen:
+                chosen = tell_by_values(chosen, self._run_empty(list(shapes))[0])
         except DetectorError as error:
             raise DetectorError(f"{self.path} is not a usable camera detector: {error}") from None
         self._layout = LAYOUTS[chosen]
@@ -88,12 +98,22 @@ class OnnxDetector:
         self._outputs = ["labels", "boxes", "scores"] if chosen == "detr" else list(shapes)
         if not set(self._outputs) <= set(shapes):
             raise DetectorError(f"{self.path}: layout detr needs outputs labels, boxes and scores, got {list(shapes)}")
-        self.own_class_names = self._own_names(names, metadata, class_count(chosen, list(shapes.values())))
+        self.own_class_names = self._own_names(recorded, class_count(chosen, list(shapes.values())))
+        if not self.reports:
+            raise DetectorError(
+                f"{self.path}: none of its classes ({shortened(', '.join(self.own_class_names))}) has a counterpart "
+                f"among {', '.join(self.class_names)}; say what they are with names=NAME,NAME,..."
+            )
 
     @property
     def layout(self) -> str:
         """Name of the output layout in use."""
         return self._layout.name
+
+    @property
+    def reports(self) -> tuple[str, ...]:
+        """The target classes that the network can report."""
+        return reported_classes(self.own_class_names, self.class_names, self._mapping)
 
     def __call__(self, images: Sequence[Image]) -> list[Detections2D]:
         """Detections of each (H, W, 3) uint8 RGB image, by descending score, in the target classes."""
@@ -182,7 +202,8 @@ class OnnxDetector:
         fixed = tuple(d if isinstance(d, int) and d > 0 else None for d in dimensions)
         if asked is None:
             recorded = _literal(metadata.get("imgsz"), list)
-            asked = (int(recorded[0]), int(recorded[1])) if recorded and len(recorded) == 2 else (DEFAULT_SIZE,) * 2
+            told = recorded is not None and len(recorded) == 2 and all(isinstance(n, int) and n > 0 for n in recorded)
+            asked = (recorded[0], recorded[1]) if told else (DEFAULT_SIZE,) * 2
         elif any(f is not None and f != a for f, a in zip(fixed, asked, strict=True)):
             raise ConfigError(f"{self.path} has a fixed input of {fixed[0]} x {fixed[1]}; leave size={wanted} out")
         return (fixed[0] or asked[0], fixed[1] or asked[1])
@@ -193,16 +214,33 @@ class OnnxDetector:
         shapes = {node.name: tuple(node.shape) for node in nodes}
         if all(isinstance(d, int) and d > 0 for shape in shapes.values() for d in shape):
             return shapes
-        self._outputs = list(shapes)
-        outputs = self._run(np.zeros((1, 3, *self._size), dtype=np.float32))
+        outputs = self._run_empty(list(shapes))
         return {node.name: np.shape(output) for node, output in zip(nodes, outputs, strict=True)}
 
-    def _own_names(
-        self, given: str | Sequence[str] | None, metadata: Mapping[str, str], count: int | None
-    ) -> tuple[str, ...]:
-        """The network's own class names, from the user, its metadata or COCO; checked against their number."""
-        names = read_class_names(given) if given is not None else _metadata_names(metadata)
+    def _run_empty(self, outputs: list[str]) -> list[NDArray[Any]]:
+        """The outputs for an empty image."""
+        self._outputs = outputs
+        return self._run(np.zeros((1, 3, *self._size), dtype=np.float32))
+
+    def _require_detector(self, image_input: Any, metadata: Mapping[str, str]) -> None:
+        """Refuse exports that take several images at once, or give something else than boxes."""
+        batch = image_input.shape[0]
+        if isinstance(batch, int) and batch != 1:
+            raise DetectorError(f"{self.path} takes a fixed batch of {batch} images; export it for one (batch=1)")
+        task = metadata.get("task", "detect")
+        if task not in ("detect", "segment"):
+            raise DetectorError(
+                f"{self.path} is an export for the task {shortened(task, 20)!r}; expected a detector of upright boxes "
+                "(task detect or segment)"
+            )
+
+    def _own_names(self, names: tuple[str, ...] | None, count: int | None) -> tuple[str, ...]:
+        """The network's own class names, from the user or its metadata, else COCO's; checked against their number."""
         if names is None and count in (None, len(COCO_CLASSES)):
+            log.warning(
+                "%s does not name its classes: COCO is assumed; names=NAME,NAME,... says otherwise",
+                self.path,
+            )
             names = COCO_CLASSES
         if names is None:
             raise DetectorError(f"{self.path} has {count} classes and does not name them; name them with names=...")
@@ -241,7 +279,10 @@ def _metadata_names(metadata: Mapping[str, str]) -> tuple[str, ...] | None:
     """Names from the ``names`` that Ultralytics records as a Python dictionary or list."""
     names = _literal(metadata.get("names"), dict) or _literal(metadata.get("names"), list)
     if isinstance(names, dict):
-        names = [names[key] for key in sorted(names, key=int)]
+        try:
+            names = [names[key] for key in sorted(names, key=int)]
+        except (ValueError, TypeError):
+            return None
     return tuple(str(name) for name in names) if names else None
 
 
@@ -249,6 +290,6 @@ def _literal(text: str | None, kind: type) -> Any:
     """The Python literal in ``text`` if it is one of ``kind``, else None."""
     try:
         value = ast.literal_eval(text or "")
-    except (ValueError, SyntaxError):
+    except (ValueError, SyntaxError, TypeError, MemoryError, RecursionError):
         return None
     return value if isinstance(value, kind) else None

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from lcf3d.errors import ConfigError
+from lcf3d.kernels import kernel
 from lcf3d.structures import BoolArray, Detections2D, FloatArray, InstanceMask, IntArray
 
 # neighbouring tiles share this part of a tile's width
@@ -14,7 +14,7 @@ OVERLAP = 0.2
 BORDER = 3.0
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _suppress(boxes, labels, order, threshold):  # type: ignore[no-untyped-def]
     """Mask of the boxes that no higher-ranked kept box of the same label overlaps by more than ``threshold``."""
     kept = np.zeros(len(boxes), dtype=np.bool_)

@@ -29,7 +29,7 @@ from lcf3d.detectors.camera.torchvision_styles import (
     normalization_of,
     normalized,
 )
-from lcf3d.detectors.classes import to_classes
+from lcf3d.detectors.classes import reported_classes, to_classes
 from lcf3d.detectors.downloads import local_path
 from lcf3d.errors import ConfigError, ShapeError
 from lcf3d.networks.checkpoints import load_parameters, read_notes, read_state_dict
@@ -207,6 +207,7 @@ class TorchvisionFasterRCNN:
         self.device = torch_device(device)
         self.network = network.eval().requires_grad_(False).to(self.device)
         self.class_names = self.style.classes if class_names is None else tuple(class_names)
+        self.reports = reported_classes(self.style.classes, self.class_names)
         self.score_threshold = score_threshold
 
     def __call__(self, images: Sequence[Image]) -> list[Detections2D]:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lcf3d.detectors.base import Image
-from lcf3d.detectors.classes import COCO_CLASSES, read_class_names, to_classes
+from lcf3d.detectors.classes import COCO_CLASSES, read_class_names, reported_classes, to_classes
 from lcf3d.errors import ConfigError, DetectorError, ShapeError
 from lcf3d.networks.checkpoints import load_parameters, read_state_dict
 from lcf3d.networks.torch import nn, torch, torch_device, torchvision
@@ -84,6 +84,7 @@ class TorchvisionDetector:
         outputs = _outputs(state, name)
         self.own_class_names, self._own_labels = _own_classes(names, outputs, checkpoint)
         self.class_names = self.own_class_names if class_names is None else tuple(class_names)
+        self.reports = reported_classes(self.own_class_names, self.class_names)
         self.device = torch_device(device)
         self.network = build_network(name, state, outputs, score_threshold).to(self.device)
 

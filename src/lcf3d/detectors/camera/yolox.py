@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from lcf3d.detectors.camera.onnx import OnnxDetector
+from lcf3d.detectors.classes import COCO_CLASSES
 from lcf3d.detectors.downloads import download
 from lcf3d.detectors.published import find_model
 from lcf3d.errors import ConfigError
@@ -43,5 +44,13 @@ def yolox(
         )
     path = download(find_model(f"yolox-{size}"))
     return OnnxDetector(
-        path, class_names, tiles, score_threshold, iou_threshold, "yolox", mapping=mapping, threads=threads
+        path,
+        class_names,
+        tiles,
+        score_threshold,
+        iou_threshold,
+        "yolox",
+        names=COCO_CLASSES,
+        mapping=mapping,
+        threads=threads,
     )

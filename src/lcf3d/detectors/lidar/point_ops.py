@@ -7,15 +7,15 @@ they are vectorised in torch. Both give the same indices.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from lcf3d.kernels import kernel
 from lcf3d.networks.torch import Tensor, torch
 
 CHUNK = 4_000_000
 """Pairwise distances computed at once."""
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _farthest(points, count):  # type: ignore[no-untyped-def]
     distance = np.full(len(points), np.inf, np.float32)
     chosen = np.zeros(count, np.int64)
@@ -31,7 +31,7 @@ def _farthest(points, count):  # type: ignore[no-untyped-def]
     return chosen
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _first_within(centers, points, squared_radius, count):  # type: ignore[no-untyped-def]
     found = np.full((len(centers), count), -1, np.int64)
     for i in range(len(centers)):

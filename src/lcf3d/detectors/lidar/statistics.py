@@ -10,11 +10,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from lcf3d.detectors.lidar.config import VoxelSpec
 from lcf3d.detectors.lidar.voxelization import select_channels
+from lcf3d.kernels import kernel
 
 QUARTERS = 4
 SLICES = 8
@@ -54,7 +54,7 @@ def _must_copy(points: NDArray[np.floating]) -> bool:
     return points.ndim != 2 or points.shape[1] < 4 or points.dtype != np.float32 or not points.flags.c_contiguous
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _gather(points, area, size, grid):  # type: ignore[no-untyped-def]
     nx, ny = grid[0], grid[1]
     row_of = np.full(nx * ny, -1, np.int32)
@@ -95,7 +95,7 @@ def _gather(points, area, size, grid):  # type: ignore[no-untyped-def]
     return sums[:count].copy(), cells[:count].copy()
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _add(row, dx, dy, up, intensity, height_slice):  # type: ignore[no-untyped-def]
     """Add a point to the sums of its pillar."""
     row[0] += 1
@@ -118,7 +118,7 @@ def _add(row, dx, dy, up, intensity, height_slice):  # type: ignore[no-untyped-d
     row[OWN + QUARTERS * OF_QUARTER + height_slice] += 1
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _finish(row, center_x, center_y):  # type: ignore[no-untyped-def]
     """Turn the sums of a pillar into its statistics."""
     n = row[0]

@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import Literal, get_args
 
 import numpy as np
-from numba import njit
 
 from lcf3d.errors import ConfigError
 from lcf3d.geometry.iou import pair_bev_iou
+from lcf3d.kernels import kernel
 from lcf3d.structures import FloatArray, IntArray
 
 NmsMode = Literal["off", "low", "keep"]
@@ -29,7 +29,7 @@ def suppression_threshold(mode: NmsMode, own: float) -> float:
     return {"off": 1.0, "low": max(LOW_NMS_IOU, own), "keep": own}[mode]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _greedy(boxes, iou_threshold):  # type: ignore[no-untyped-def]
     kept = np.empty(len(boxes), np.int64)
     n = 0
