@@ -151,6 +151,14 @@ class Fuser:
         with self._lock:
             return {f"{source}: {cause}": count for (source, cause), count in sorted(self._sync.dropped.items())}
 
+    def turned_deg(self) -> dict[str, float]:
+        """How far each camera has turned against its calibration, in degrees, as far as the watch knows."""
+        with self._lock:
+            if self.watch is None:
+                return {}
+            reports = {name: self.watch.estimate(name) for name in self.watch.cameras}
+            return {name: float(np.rad2deg(np.linalg.norm(found.rotation))) for name, found in reports.items()}
+
     def diagnostics(self) -> list[dict[str, Any]]:
         """Health of every part as plain values in the form of ROS ``diagnostic_msgs/DiagnosticStatus``."""
         with self._lock:
