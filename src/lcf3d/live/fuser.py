@@ -26,15 +26,12 @@ from lcf3d.live.messages import (
     same_mount,
     source_of,
 )
-from lcf3d.live.poses import PoseBuffer
+from lcf3d.live.poses import PoseBuffer, relative_velocities
 from lcf3d.live.synchronizer import CameraPart, Group, Synchronizer, SyncSettings
 from lcf3d.live.warming import warm_up
 from lcf3d.live.workers import Worker, attempt
 from lcf3d.provenance import FusedDetections
 from lcf3d.structures import Camera, Detections2D, Detections3D, FloatArray, Frame
-
-# what a detector believes to move more slowly than this is taken to stand (m/s)
-STANDING = 1.5
 
 
 @dataclass(frozen=True)
@@ -380,15 +377,7 @@ class Fuser:
             return None
         step = ahead if abs(ahead) > 0.05 else -0.05
         motion = self._poses.motion(time, time + step)
-        if motion is None:
-            return None
-        centres = lidar.boxes[:, :3]
-        relative = (centres @ motion[:3, :3].T + motion[:3, 3] - centres) / step
-        if lidar.velocities is not None:
-            moving = np.nan_to_num(lidar.velocities)
-            # noise in the velocities of things that stand would make every offset look smaller
-            relative[:, :2] += np.where(np.hypot(moving[:, :1], moving[:, 1:]) > STANDING, moving, 0)
-        return np.asarray(relative)
+        return None if motion is None else relative_velocities(lidar, motion, step)
 
     def _notes(self, group: Group, blinded: Iterable[str]) -> list[str]:
         notes = [f"camera {n} sees far less than it used to and was not used" for n in sorted(blinded)]
