@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from lcf3d.evaluation.generalization import evaluate_generalization
     from lcf3d.formats.coco import read_camera_detections, read_coco_index, read_coco_results
     from lcf3d.formats.plain import read_detections_2d, read_detections_3d, write_detections_2d, write_detections_3d
+    from lcf3d.fusion.alignment_watch import AlignmentWatch, WatchSettings
     from lcf3d.fusion.calibration import Calibration
     from lcf3d.fusion.config import FusionConfig
     from lcf3d.fusion.evidence import Evidence
@@ -39,6 +40,9 @@ if TYPE_CHECKING:
     from lcf3d.fusion.pipeline import LateCascadeFusion
     from lcf3d.fusion.self_calibration import self_calibrate
     from lcf3d.fusion.stereo import StereoConfig, StereoLateCascadeFusion
+    from lcf3d.live.fuser import Fuser, LiveSettings
+    from lcf3d.live.messages import CameraBoxes, CameraModel, EgoPose, Image, LidarBoxes, Scan
+    from lcf3d.live.synchronizer import SyncSettings
     from lcf3d.localizers.geometric import GeometricLocalizer
     from lcf3d.localizers.named import load_localizer
     from lcf3d.localizers.shapes import SHAPES, ObjectShape
@@ -51,6 +55,17 @@ except PackageNotFoundError:  # run from a source tree that is not installed
 
 # name -> module; scipy, numba and pydantic are imported when first needed, so that ``import lcf3d`` stays quick
 _LAZY = {
+    "AlignmentWatch": "fusion.alignment_watch",
+    "CameraBoxes": "live.messages",
+    "CameraModel": "live.messages",
+    "EgoPose": "live.messages",
+    "Fuser": "live.fuser",
+    "Image": "live.messages",
+    "LidarBoxes": "live.messages",
+    "LiveSettings": "live.fuser",
+    "Scan": "live.messages",
+    "SyncSettings": "live.synchronizer",
+    "WatchSettings": "fusion.alignment_watch",
     "BaseDataset": "datasets.base",
     "Calibration": "fusion.calibration",
     "Dataset": "datasets.base",
@@ -97,28 +112,39 @@ __all__ = [
     "KITTI_CLASSES",
     "NUSCENES_CLASSES",
     "SHAPES",
+    "AlignmentWatch",
     "BaseDataset",
     "Calibration",
     "Camera",
+    "CameraBoxes",
+    "CameraModel",
     "Dataset",
     "Detections2D",
     "Detections3D",
     "Distortion",
+    "EgoPose",
     "Evidence",
     "Frame",
     "FusedDetections",
+    "Fuser",
     "FusionConfig",
     "GeometricLocalizer",
+    "Image",
     "InstanceMask",
     "KittiDataset",
     "LateCascadeFusion",
     "Lcf3dError",
+    "LidarBoxes",
+    "LiveSettings",
     "NuscenesDataset",
     "ObjectShape",
     "Outcome",
     "Reason",
+    "Scan",
     "StereoConfig",
     "StereoLateCascadeFusion",
+    "SyncSettings",
+    "WatchSettings",
     "adapt_points",
     "draw",
     "evaluate",

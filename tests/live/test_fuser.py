@@ -239,6 +239,17 @@ def test_the_watch_corrects_a_turned_camera():
     assert entry(target, "camera left")["level"] == 2
 
 
+def test_in_real_time_the_watch_has_a_thread_of_its_own():
+    target = fuser(realtime=True, watch=WatchSettings(every=1))
+    messages = list(stream(8))
+    for message in messages:
+        target.push(message)
+    target.flush()
+    assert target.watch.report("left").frames >= 1
+    assert target.watch.estimate("left").pairs > 0
+    target.close()
+
+
 def test_warm_up_runs_everything_without_a_result():
     calls = []
     target = fuser(detectors={"left": lambda images: calls.append(images) or [boxes2d(camera(), street(0))]})

@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from lcf3d.live.poses import PoseBuffer
+from lcf3d.live.poses import PoseBuffer, relative_velocities
+from lcf3d.structures import Detections3D
 
 
 def pose(x, yaw):
@@ -43,3 +44,10 @@ def test_old_poses_are_forgotten():
         buffer.add(0.1 * i, np.eye(4))
     assert len(buffer) <= 52
     assert buffer.newest == pytest.approx(19.9)
+
+
+def test_velocities_as_seen_from_the_moving_car():
+    boxes = np.array([[10.0, 0, 0, 4, 2, 1.5, 0], [20.0, 0, 0, 4, 2, 1.5, 0], [30.0, 0, 0, 4, 2, 1.5, 0]])
+    lidar = Detections3D(boxes, np.ones(3), np.zeros(3, int), ("Car",), [[15.0, 0], [0.5, 0], [np.nan, np.nan]])
+    # one metre ahead in 0.1 s: what stands comes nearer with 10 m/s; half a metre a second counts as standing
+    assert np.allclose(relative_velocities(lidar, pose(-1.0, 0.0), 0.1)[:, 0], [5.0, -10.0, -10.0])

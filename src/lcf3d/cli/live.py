@@ -30,6 +30,7 @@ def live(
         bool, typer.Option("--self-calibrate", help="turn each camera as the calibration watch says")
     ] = False,
     health: Annotated[Path | None, typer.Option(help="write a JSON line of health after each second here")] = None,
+    rerun: Annotated[str | None, typer.Option(help="a .rrd file to record into, or viewer to watch it live")] = None,
     json_: Annotated[bool, typer.Option("--json", help="print the report as JSON")] = False,
 ) -> None:
     """Replay a dataset in real time and watch latency, what is dropped, each sensor's health and calibration.
@@ -62,14 +63,25 @@ def live(
     lines: list[str] = []
     said = [0.0]
 
-    def write_health(results: list[LiveResult]) -> None:
+    log = None
+    if rerun is not None:
+        from lcf3d.visualization.rerun_log import RerunLog
+
+        log = RerunLog(None if rerun == "viewer" else Path(rerun), inputs.dataset.used_cameras)
+
+    def look(results: list[LiveResult]) -> None:
+        if log is not None:
+            for result in results:
+                log.log(result.frame, result.fused, latency_ms=result.latency_ms, alignment_deg=fuser.turned_deg())
         if health is not None and results[-1].time - said[0] >= 1:
             said[0] = results[-1].time
             lines.append(json.dumps({"time": results[-1].time, "status": fuser.diagnostics()}))
 
     report = replay(
-        inputs.dataset, frame_ids, inputs.lidar, inputs.cameras, fuser, rate=rate, hertz=hertz, on_results=write_health
+        inputs.dataset, frame_ids, inputs.lidar, inputs.cameras, fuser, rate=rate, hertz=hertz, on_results=look
     )
+    if log is not None:
+        log.close()
     if health is not None:
         from lcf3d.files import write_text
 

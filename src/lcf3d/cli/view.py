@@ -28,6 +28,10 @@ def view(
     truth: Annotated[bool, typer.Option(help="also draw the ground truth, thin and white")] = True,
     limit: Annotated[int | None, typer.Option(min=1, help="draw at most so many frames")] = None,
     min_score: Annotated[float, typer.Option(help="leave out boxes of a lower score")] = float("-inf"),
+    rerun: Annotated[
+        str | None,
+        typer.Option(help="no pictures but a Rerun recording: a .rrd file, or viewer to open it (run folders)"),
+    ] = None,
 ) -> None:
     """Draw frames: images with boxes coloured by stage, and the bird's-eye view.
 
@@ -38,6 +42,8 @@ def view(
     lcf3d view fused/ --frame 000008 --out picture.png
 
     lcf3d view kitti:KITTI --frame 000008 --results fused/
+
+    lcf3d view fused/ --rerun fused.rrd
     """
     from rich.progress import Progress
 
@@ -50,6 +56,9 @@ def view(
     dataset = _open_run(run_folder) if run_folder else open_dataset(source)
     shown = run_folder or results
     ids = _frame_ids(dataset, frame or [], shown, limit)
+    if rerun is not None:
+        _record(dataset, shown, ids, None if rerun == "viewer" else Path(rerun), truth)
+        return
     scene_of = _scenes(dataset, shown, truth, min_score, ids[0])
     paths = _paths(ids, out, run_folder)
     with Progress(disable=len(ids) < 2) as progress:
@@ -57,6 +66,27 @@ def view(
             item = dataset.frame(frame_id)
             save_png(draw_frame(item, scene_of(item)), paths[frame_id])
     typer.echo(str(paths[ids[0]] if len(ids) == 1 else f"{len(ids)} pictures in {paths[ids[0]].parent}"))
+
+
+def _record(dataset: Dataset, shown: Path | None, ids: Sequence[str], path: Path | None, truth: bool) -> None:
+    """The frames of a run into a Rerun recording or viewer."""
+    from rich.progress import Progress
+
+    from lcf3d.run.folder import RunFolder
+    from lcf3d.visualization.rerun_log import RerunLog
+
+    if shown is None or not RunFolder.is_run(shown):
+        raise ConfigError("--rerun shows a run with its reasons: name a folder written by lcf3d run")
+    if path is not None and path.suffix != ".rrd":
+        raise ConfigError(f"--rerun takes a file that ends in .rrd, or viewer, got {path}")
+    folder = RunFolder(shown)
+    log = RerunLog(path, dataset.used_cameras)
+    with Progress(disable=len(ids) < 2) as progress:
+        for frame_id in progress.track(ids, description="recording"):
+            frame = dataset.frame(frame_id)
+            log.log(frame, folder.read(frame_id), truth=frame.labels if truth else None)
+    log.close()
+    typer.echo(f"{len(ids)} frames in {path or 'the viewer'}")
 
 
 def _run_folder(source: str) -> Path | None:

@@ -21,7 +21,7 @@ REACH, BIN = np.deg2rad(8.0), np.deg2rad(0.25)
 # two boxes may be the same object when their sides differ by less than these factors (logarithms): width, height
 SIDES = np.array([0.5, 0.2])
 # states of `lcf3d.fusion.alignment` this near to each other match the same boxes but for a few
-NEARLY = np.array([np.deg2rad(0.05)] * 3 + [0.03] * 3 + [np.inf] * 2 + [0.01])
+NEARLY = np.array([np.deg2rad(0.15)] * 3 + [0.06] * 3 + [np.inf] * 2 + [0.01])
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,16 +15,23 @@ from lcf3d.errors import ConfigError
 from lcf3d.fusion.alignment_watch import AlignmentWatch, WatchSettings
 from lcf3d.fusion.pipeline import LateCascadeFusion
 from lcf3d.live.health import Health
-from lcf3d.live.messages import CameraBoxes, CameraModel, EgoPose, Image, LidarBoxes, Message, Scan, source_of
-from lcf3d.live.poses import PoseBuffer
+from lcf3d.live.messages import (
+    CameraBoxes,
+    CameraModel,
+    EgoPose,
+    Image,
+    LidarBoxes,
+    Message,
+    Scan,
+    same_mount,
+    source_of,
+)
+from lcf3d.live.poses import PoseBuffer, relative_velocities
 from lcf3d.live.synchronizer import CameraPart, Group, Synchronizer, SyncSettings
 from lcf3d.live.warming import warm_up
 from lcf3d.live.workers import Worker, attempt
 from lcf3d.provenance import FusedDetections
-from lcf3d.structures import Camera, Detections3D, FloatArray, Frame
-
-# what a detector believes to move more slowly than this is taken to stand (m/s)
-STANDING = 1.5
+from lcf3d.structures import Camera, Detections2D, Detections3D, FloatArray, Frame
 
 
 @dataclass(frozen=True)
@@ -33,8 +40,8 @@ class LiveSettings:
 
     Attributes:
         sync: how messages are grouped.
-        realtime: run detectors in threads, newest first. Without it they run when a message is pushed and nothing is
-            left out for want of time: the same messages give the same results.
+        realtime: run detectors and the watch in threads, newest first. Without it they run when a message is pushed and
+            nothing is left out for want of time: the same messages give the same results.
         watch: settings of the calibration watch, None for no watch.
         watch_period: seconds from one frame that the watch looks at to the next: those in between show the same.
         correct: turn each camera as the watch says, and move it in time.
@@ -151,6 +158,14 @@ class Fuser:
         with self._lock:
             return {f"{source}: {cause}": count for (source, cause), count in sorted(self._sync.dropped.items())}
 
+    def turned_deg(self) -> dict[str, float]:
+        """How far each camera has turned against its calibration, in degrees, as far as the watch knows."""
+        with self._lock:
+            if self.watch is None:
+                return {}
+            reports = {name: self.watch.estimate(name) for name in self.watch.cameras}
+            return {name: float(np.rad2deg(np.linalg.norm(found.rotation))) for name, found in reports.items()}
+
     def diagnostics(self) -> list[dict[str, Any]]:
         """Health of every part as plain values in the form of ROS ``diagnostic_msgs/DiagnosticStatus``."""
         with self._lock:
@@ -201,7 +216,7 @@ class Fuser:
         Where it differs by more than the motion of a car between scan and image, the watch begins anew.
         """
         known = self._models.setdefault(message.camera.name, [])
-        anew = bool(known) and not _nearly(known[-1][1], message.camera)
+        anew = bool(known) and not same_mount(known[-1][1], message.camera)
         if anew:
             self.health.tell(f"camera {message.camera.name}: new calibration at {message.time:.3f} s")
         known.append((message.time if known else -np.inf, message.camera))
@@ -299,8 +314,31 @@ class Fuser:
         self.health.fused(frame, result, found, latency, group.points)
         if self.watch is not None and not 0 <= group.time - self._watched < 0.9 * self.settings.watch_period:
             self._watched = group.time
-            lidar = group.lidar
-            self.watch.observe(nominal, lidar, found, lambda ahead: self._relative_velocities(group.time, lidar, ahead))
+            self._observe(nominal, group.lidar, found)
+
+    def _observe(self, nominal: Frame, lidar: Detections3D, found: dict[str, Detections2D]) -> None:
+        """Show a moment to the watch: in real time in a thread of its own, where it skips what it has no time for."""
+        watch, time = self.watch, float(nominal.timestamp or 0.0)
+        assert watch is not None
+
+        def velocities(ahead: float) -> FloatArray | None:
+            with self._lock:
+                return self._relative_velocities(time, lidar, ahead)
+
+        def work(_: Any) -> None:
+            watch.observe(nominal, lidar, found, velocities)
+
+        if not self.settings.realtime:
+            work(None)
+            return
+
+        def done(_: Any, result: Any, error: Exception | None, spent: float) -> None:
+            if error is not None:
+                self.health.failed("watch", error)
+
+        if "watch" not in self._workers:
+            self._workers["watch"] = Worker("watch", lambda task: task(None), done)
+        self._workers["watch"].submit(work)
 
     def _frame(self, group: Group) -> tuple[Frame, Frame]:
         """What is fused, with each camera as it stood at its own moment; and the same without corrections."""
@@ -339,15 +377,7 @@ class Fuser:
             return None
         step = ahead if abs(ahead) > 0.05 else -0.05
         motion = self._poses.motion(time, time + step)
-        if motion is None:
-            return None
-        centres = lidar.boxes[:, :3]
-        relative = (centres @ motion[:3, :3].T + motion[:3, 3] - centres) / step
-        if lidar.velocities is not None:
-            moving = np.nan_to_num(lidar.velocities)
-            # noise in the velocities of things that stand would make every offset look smaller
-            relative[:, :2] += np.where(np.hypot(moving[:, :1], moving[:, 1:]) > STANDING, moving, 0)
-        return np.asarray(relative)
+        return None if motion is None else relative_velocities(lidar, motion, step)
 
     def _notes(self, group: Group, blinded: Iterable[str]) -> list[str]:
         notes = [f"camera {n} sees far less than it used to and was not used" for n in sorted(blinded)]
@@ -363,13 +393,3 @@ class Fuser:
     def _detector_times(self, group: Group) -> dict[str, float]:
         times = {"scan": group.time, **{f"camera {n}": p.time for n, p in group.cameras.items()}}
         return {f"detect {s}": self._detect_ms[s, t] for s, t in times.items() if (s, t) in self._detect_ms}
-
-
-def _nearly(camera: Camera, other: Camera) -> bool:
-    """Whether two calibrations are of one camera on a moving car: equal but for a turn by a degree or so."""
-    turn = camera.camera_from_lidar[:3, :3].T @ other.camera_from_lidar[:3, :3]
-    same = np.allclose(camera.projection, other.projection) and (camera.width, camera.height) == (
-        other.width,
-        other.height,
-    )
-    return bool(same and np.trace(turn) > 1 + 2 * np.cos(np.deg2rad(3.0)))

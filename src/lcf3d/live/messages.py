@@ -70,3 +70,13 @@ def source_of(message: Message) -> str:
     if isinstance(message, CameraModel):
         return f"calibration {message.camera.name}"
     return {Scan: "scan", LidarBoxes: "lidar", EgoPose: "pose"}[type(message)]
+
+
+def same_mount(camera: Camera, other: Camera) -> bool:
+    """Whether two calibrations are of one camera on a moving car: equal but for a turn by a degree or so."""
+    turn = camera.camera_from_lidar[:3, :3].T @ other.camera_from_lidar[:3, :3]
+    same = np.allclose(camera.projection, other.projection) and (camera.width, camera.height) == (
+        other.width,
+        other.height,
+    )
+    return bool(same and np.trace(turn) > 1 + 2 * np.cos(np.deg2rad(3.0)))

@@ -7,10 +7,12 @@ from bisect import bisect_left, insort
 import numpy as np
 
 from lcf3d.geometry.rotation import invert_rigid, quaternions_from_matrices, rigid_transforms
-from lcf3d.structures import FloatArray
+from lcf3d.structures import Detections3D, FloatArray
 
 # beyond the newest pose the last motion is carried on for so long (seconds)
 CARRY_ON = 0.25
+# what a detector believes to move more slowly than this is taken to stand (m/s)
+STANDING = 1.5
 # poses older than this before the newest are forgotten
 KEPT = 5.0
 
@@ -69,3 +71,16 @@ def interpolated(first: FloatArray, second: FloatArray, share: float) -> FloatAr
     moved = (1 - share) * first[:3, 3] + share * second[:3, 3]
     pose: FloatArray = rigid_transforms(turned[None], moved[None])[0]
     return pose
+
+
+def relative_velocities(lidar: Detections3D, motion: FloatArray, seconds: float) -> FloatArray:
+    """(N, 3) m/s of boxes as seen from a LiDAR that makes a (4, 4) motion in some seconds, in its axes.
+
+    Noise in the velocities of things that stand would make every time offset look smaller: slow ones count as none.
+    """
+    centres = lidar.boxes[:, :3]
+    relative = (centres @ motion[:3, :3].T + motion[:3, 3] - centres) / seconds
+    if lidar.velocities is not None:
+        moving = np.nan_to_num(lidar.velocities)
+        relative[:, :2] += np.where(np.hypot(moving[:, :1], moving[:, 1:]) > STANDING, moving, 0)
+    return np.asarray(relative)

@@ -1,0 +1,204 @@
+"""Frames and what was decided in them as a Rerun recording, or live in its viewer (extra ``viz``)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lcf3d.errors import MissingExtraError
+from lcf3d.geometry.rotation import quaternions_from_yaws
+from lcf3d.provenance import FusedDetections
+from lcf3d.structures import Camera, Detections3D, FloatArray, Frame
+from lcf3d.visualization.scene import CAMERA_COLOUR, COLOURS, TRUTH_COLOUR, Scene
+
+_GREY = (110, 115, 120)
+# scans and images of more than this are thinned, so that a recording of a drive stays small
+MOST_POINTS = 60_000
+JPEG_QUALITY = 80
+
+
+class RerunLog:
+    """Writes frame after frame into a recording file, or into the viewer that it opens.
+
+    Args:
+        path: the ``.rrd`` file; without one the viewer is opened.
+        cameras: names of the cameras, for the layout.
+
+    Raises:
+        MissingExtraError: rerun-sdk is not installed.
+    """
+
+    def __init__(self, path: Path | None, cameras: Sequence[str]) -> None:
+        try:
+            import rerun
+            import rerun.blueprint
+        except ImportError:
+            raise MissingExtraError("rerun-sdk", "viz", "the Rerun viewer") from None
+        self._rerun: Any = rerun
+        self._stream: Any = rerun.RecordingStream("lcf3d")
+        if path is None:
+            self._stream.spawn()
+        else:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._stream.save(path)
+        self._stream.send_blueprint(_blueprint(rerun.blueprint, cameras))
+        self._stream.log("world", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        self._index = 0
+
+    def log(
+        self,
+        frame: Frame,
+        fused: FusedDetections,
+        *,
+        truth: Detections3D | None = None,
+        latency_ms: Mapping[str, float] | None = None,
+        alignment_deg: Mapping[str, float] | None = None,
+    ) -> None:
+        """One frame: cameras with images and boxes, the scan coloured by what was decided, boxes with their reasons.
+
+        Args:
+            frame: the frame.
+            fused: what came of it.
+            truth: ground truth to draw, if any.
+            latency_ms: milliseconds by stage, for the timeline.
+            alignment_deg: how far each camera has turned against its calibration, by name, for the timeline.
+        """
+        scene = Scene.from_fused(fused, truth)
+        self._stream.set_time("frame", sequence=self._index)
+        if frame.timestamp is not None:
+            self._stream.set_time("time", duration=frame.timestamp)
+        self._index += 1
+        self._log_boxes("world/boxes", scene.boxes, [COLOURS[o] for o in scene.outcomes], scene.texts)
+        if scene.truth is not None:
+            self._log_boxes("world/truth", scene.truth, [TRUTH_COLOUR] * len(scene.truth), ())
+        self._log_points(frame.points, scene)
+        for camera in frame.cameras:
+            self._log_camera(camera, frame, scene)
+        self._log_masks(frame, fused)
+        self._log_texts_and_curves(fused, latency_ms or {}, alignment_deg or {})
+
+    def close(self) -> None:
+        """Write what is not yet written."""
+        self._stream.flush()
+        self._stream.disconnect()
+
+    def _log_boxes(
+        self, entity: str, boxes: FloatArray, colours: Sequence[tuple[int, int, int]], texts: Sequence[str]
+    ) -> None:
+        quaternions = quaternions_from_yaws(boxes[:, 6])[:, [1, 2, 3, 0]]
+        self._stream.log(
+            entity,
+            self._rerun.Boxes3D(
+                centers=boxes[:, :3],
+                half_sizes=boxes[:, 3:6] / 2,
+                quaternions=quaternions,
+                colors=np.array(colours, dtype=np.uint8).reshape(-1, 3),
+                labels=list(texts) or None,
+                show_labels=False,
+            ),
+        )
+
+    def _log_points(self, points: NDArray[np.float32] | None, scene: Scene) -> None:
+        if points is None:
+            return
+        thinned = points[:: -(-len(points) // MOST_POINTS) or 1]
+        self._stream.log(
+            "world/scan", self._rerun.Points3D(thinned[:, :3], colors=point_colours(thinned, scene), radii=0.03)
+        )
+
+    def _log_camera(self, camera: Camera, frame: Frame, scene: Scene) -> None:
+        entity = f"world/cameras/{camera.name}"
+        self._stream.log(
+            entity,
+            self._rerun.Transform3D(
+                translation=camera.camera_from_lidar[:3, 3],
+                mat3x3=camera.camera_from_lidar[:3, :3],
+                relation=self._rerun.TransformRelation.ChildFromParent,
+            ),
+        )
+        resolution = [camera.width, camera.height]
+        self._stream.log(
+            f"{entity}/image", self._rerun.Pinhole(image_from_camera=camera.intrinsics, resolution=resolution)
+        )
+        pixels = frame.images.get(camera.name)
+        if pixels is not None:
+            self._stream.log(f"{entity}/image", self._rerun.Image(pixels).compress(jpeg_quality=JPEG_QUALITY))
+        found = scene.image_boxes.get(camera.name)
+        if found is not None:
+            colours = [CAMERA_COLOUR if used else COLOURS["dropped"] for used in found.used]
+            self._stream.log(
+                f"{entity}/image/boxes",
+                self._rerun.Boxes2D(
+                    array=found.boxes,
+                    array_format=self._rerun.Box2DFormat.XYXY,
+                    colors=np.array(colours, dtype=np.uint8).reshape(-1, 3),
+                    labels=list(found.texts),
+                ),
+            )
+
+    def _log_masks(self, frame: Frame, fused: FusedDetections) -> None:
+        """Instance masks of each camera as one picture of numbers: 0 for no object."""
+        for name, found in zip(fused.camera_names, fused.camera_inputs, strict=True):
+            if found.masks is None:
+                continue
+            camera = frame.camera(name)
+            picture = np.zeros((camera.height, camera.width), np.uint8)
+            for number, mask in enumerate(found.masks):
+                if mask is not None:
+                    height, width = mask.bitmap.shape
+                    part = picture[mask.y : mask.y + height, mask.x : mask.x + width]
+                    part[mask.bitmap[: part.shape[0], : part.shape[1]]] = number % 255 + 1
+            self._stream.log(f"world/cameras/{name}/image/masks", self._rerun.SegmentationImage(picture, opacity=0.4))
+
+    def _log_texts_and_curves(
+        self, fused: FusedDetections, latency_ms: Mapping[str, float], alignment_deg: Mapping[str, float]
+    ) -> None:
+        lines = [f"- {fused.explain(i)}" for i in range(len(fused))] + [f"- *{note}*" for note in fused.notes]
+        self._stream.log("reasons", self._rerun.TextDocument("\n".join(lines) or "nothing", media_type="text/markdown"))
+        scores = fused.detections.scores
+        curves = {"scores/highest": float(scores.max()) if len(scores) else 0.0, "scores/boxes": float(len(scores))}
+        curves |= {f"latency/{part}": value for part, value in latency_ms.items()}
+        curves |= {f"alignment/{camera}": value for camera, value in alignment_deg.items()}
+        for entity, value in curves.items():
+            self._stream.log(entity, self._rerun.Scalars(value))
+
+
+def point_colours(points: NDArray[np.float32], scene: Scene) -> NDArray[np.uint8]:
+    """(N, 3) colours of points: that of the outcome of the box they lie in, grey outside of all."""
+    colours = np.full((len(points), 3), _GREY, dtype=np.uint8)
+    for i in scene.drawing_order:
+        x, y, z, length, width, height, yaw = scene.boxes[i]
+        moved = points[:, :3] - np.array([x, y, z])
+        along = np.cos(yaw) * moved[:, 0] + np.sin(yaw) * moved[:, 1]
+        across = np.cos(yaw) * moved[:, 1] - np.sin(yaw) * moved[:, 0]
+        inside = (np.abs(along) <= length / 2) & (np.abs(across) <= width / 2) & (np.abs(moved[:, 2]) <= height / 2)
+        colours[inside] = COLOURS[scene.outcomes[i]]
+    return colours
+
+
+def _blueprint(blueprint: Any, cameras: Sequence[str]) -> Any:
+    """Scan and boxes beside the reasons; cameras below; curves of scores, latency and alignment at the bottom."""
+    views = [
+        blueprint.Spatial2DView(origin=f"world/cameras/{name}/image", name=name, contents="$origin/**")
+        for name in cameras
+    ]
+    curves = [
+        blueprint.TimeSeriesView(origin=name, name=name.capitalize()) for name in ("scores", "latency", "alignment")
+    ]
+    return blueprint.Blueprint(
+        blueprint.Vertical(
+            blueprint.Horizontal(
+                blueprint.Spatial3DView(origin="world", name="Scan and boxes"),
+                blueprint.TextDocumentView(origin="reasons", name="Reasons"),
+                column_shares=[3, 1],
+            ),
+            *([blueprint.Horizontal(*views)] if views else []),
+            blueprint.Horizontal(*curves),
+            row_shares=[4, *([2] if views else []), 1],
+        ),
+        collapse_panels=True,
+    )

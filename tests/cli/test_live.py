@@ -1,0 +1,99 @@
+import json
+from importlib.metadata import EntryPoint
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from lcf3d import plugins
+from lcf3d.cli.app import app
+from lcf3d.errors import ConfigError
+from lcf3d.live.replay import frame_times
+from lcf3d.run.folder import RunFolder
+from tests.datasets.toy import write_toy
+
+
+@pytest.fixture
+def toy(tmp_path, monkeypatch):
+    """Twelve frames with results of two detectors, and the arguments that name them."""
+    known = plugins._points
+    point = EntryPoint("toy", "tests.datasets.toy:ToyDataset", "lcf3d.datasets")
+    monkeypatch.setattr(plugins, "_points", lambda g: {**known(g), **({"toy": point} if g == point.group else {})})
+    write_toy(tmp_path, 12)
+    branches = ["--lidar", f"results:{tmp_path / 'lidar'}", "--camera", f"results:{tmp_path / 'camera'}"]
+    return [f"toy:{tmp_path / 'data'}", *branches]
+
+
+def lcf3d(*arguments):
+    result = CliRunner().invoke(app, [str(a) for a in arguments], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    return result.output
+
+
+def test_a_replay_reports_latency_health_and_nothing_dropped(toy, tmp_path):
+    report = json.loads(lcf3d("live", *toy, "--rate", "0", "--recovery", "off", "--json"))
+    assert (report["frames"], report["results"], report["dropped"]) == (12, 12, {})
+    assert report["latency_ms"]["added"]["p99"] > 0
+    assert [status["hardware_id"] for status in report["diagnostics"]] == ["fusion", "lidar", "camera front"]
+
+
+def test_real_time_takes_its_time_and_health_is_written(toy, tmp_path):
+    told = lcf3d(
+        "live", *toy, "--rate", "4", "--hertz", "10", "--health", tmp_path / "health.jsonl", "--recovery", "off"
+    )
+    assert "12 results" in told
+    assert "camera front: ok" in told
+    (line,) = (tmp_path / "health.jsonl").read_text().splitlines()
+    assert json.loads(line)["status"][0]["hardware_id"] == "fusion"
+
+
+def test_the_stream_gives_what_the_run_gives(toy, tmp_path, monkeypatch):
+    from lcf3d.live import replay
+
+    came = {}
+    inner = replay.make_fuser
+
+    def spy(*arguments, **options):
+        options["on_result"] = lambda result: came.update({result.frame.id: result.fused})
+        return inner(*arguments, **options)
+
+    monkeypatch.setattr(replay, "make_fuser", spy)
+    lcf3d("live", *toy, "--rate", "0", "--recovery", "on")
+    lcf3d("run", *toy, "--out", tmp_path / "fused", "--recovery", "on")
+    folder = RunFolder(tmp_path / "fused")
+    assert len(came) == 12
+    for fused, frame_id in zip(came.values(), folder.frame_ids(), strict=True):
+        written = folder.read(frame_id)
+        np.testing.assert_allclose(fused.detections.boxes, written.detections.boxes, atol=1e-5)
+        np.testing.assert_allclose(fused.detections.scores, written.detections.scores, atol=1e-6)
+
+
+def test_check_says_how_the_camera_stands(toy):
+    told = CliRunner().invoke(app, ["check", *toy]).output
+    assert "camera front: ok; pitch" in told
+    with pytest.raises(ConfigError, match="takes both"):
+        CliRunner().invoke(app, ["check", *toy[:3]], catch_exceptions=False)
+
+
+def test_a_run_may_turn_its_cameras(toy, tmp_path):
+    lcf3d("run", *toy, "--out", tmp_path / "fused", "--recovery", "off", "--self-calibrate")
+    alignment = json.loads((tmp_path / "fused" / "alignment.json").read_text())["front"]
+    assert alignment["status"] == "ok"
+    assert abs(alignment["yaw"]["deg"]) < 0.2
+
+
+def test_a_recording_is_written(toy, tmp_path):
+    pytest.importorskip("rerun")
+    lcf3d("live", *toy, "--rate", "0", "--recovery", "off", "--rerun", tmp_path / "live.rrd")
+    lcf3d("run", *toy, "--out", tmp_path / "fused", "--recovery", "off")
+    lcf3d("view", tmp_path / "fused", "--rerun", tmp_path / "run.rrd")
+    assert (tmp_path / "live.rrd").stat().st_size > 1000
+    assert (tmp_path / "run.rrd").stat().st_size > 1000
+    with pytest.raises(ConfigError, match=r"\.rrd"):
+        CliRunner().invoke(app, ["view", str(tmp_path / "fused"), "--rerun", "x.png"], catch_exceptions=False)
+
+
+def test_times_of_a_replay_always_rise():
+    assert frame_times([None, None, None], 10.0) == pytest.approx([0.0, 0.1, 0.2])
+    # half a second, then another drive that begins earlier, then a gap of an hour
+    assert frame_times([5.0, 5.5, 0.0, 3600.0], 10.0) == pytest.approx([0.0, 0.5, 1.5, 2.5])
