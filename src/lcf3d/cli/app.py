@@ -19,6 +19,7 @@ VERBS: dict[str, str] = {
     "ros2": "ros2",
     "view": "view",
     "eval": "eval",
+    "init": "init",
     "config": "config",
     "check": "check",
     "bench": "bench",

@@ -11,6 +11,7 @@ import typer
 from lcf3d.errors import ConfigError
 
 if TYPE_CHECKING:
+    from lcf3d.datasets.base import Dataset
     from lcf3d.datasets.check import Finding
 
 
@@ -24,6 +25,9 @@ def check(
         str | None,
         typer.Option(help="... camera detector, kind:argument: how does each camera stand against the LiDAR?"),
     ] = None,
+    picture: Annotated[
+        Path | None, typer.Option(help="write a PNG of the first frame: images with the scan's points and the labels")
+    ] = None,
     json_: Annotated[bool, typer.Option("--json", help="print the findings as JSON")] = False,
 ) -> None:
     """Look a dataset over before it costs an evening: files, shapes, calibration against labels and scans.
@@ -35,12 +39,15 @@ def check(
     lcf3d check kitti:KITTI --split val --results runs/point_gnn/data
 
     lcf3d check kitti:KITTI --lidar results:point_gnn --camera results:rcnn_2d
+
+    lcf3d check folder:drive --picture check.png
     """
     import json
     from dataclasses import asdict
 
     from rich.progress import Progress
 
+    from lcf3d.datasets.check_picture import draw_check
     from lcf3d.datasets.opening import check_dataset
 
     with Progress(disable=json_) as progress:
@@ -49,7 +56,14 @@ def check(
             task = progress.add_task("checking", total=frames)
             return lambda: progress.advance(task)
 
-        findings = check_dataset(dataset, results, begin, split=split, version=tables)
+        def tell(opened: Dataset) -> None:
+            if not json_:
+                for line in opened.describe():
+                    progress.console.print(line, markup=False, highlight=False, soft_wrap=True)
+            if picture is not None:
+                draw_check(opened).save(picture)
+
+        findings = check_dataset(dataset, results, begin, tell, split=split, version=tables)
     if (lidar is None) != (camera is None):
         raise ConfigError("how cameras stand against the LiDAR takes both, --lidar and --camera")
     if lidar is not None and camera is not None:

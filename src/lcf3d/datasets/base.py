@@ -114,6 +114,10 @@ class Dataset(Protocol):
         """What writes a run's results into a folder."""
         ...
 
+    def describe(self) -> list[str]:
+        """What was understood of the dataset, line by line, for people."""
+        ...
+
     def check(self, results: Path | None = None, progress: Callable[[], None] = lambda: None) -> list[Finding]:
         """What is wrong with the dataset and, if given, with result files for it; ``progress`` is called a frame."""
         ...
@@ -178,6 +182,10 @@ class BaseDataset(Sequence[Frame]):
         from lcf3d.datasets.plain_results import PlainWriter
 
         return PlainWriter(folder)
+
+    def describe(self) -> list[str]:
+        """How many frames and which cameras there are."""
+        return [f"{len(self)} frames, cameras {', '.join(self.camera_names)}, classes {', '.join(self.class_names)}"]
 
     def check(self, results: Path | None = None, progress: Callable[[], None] = lambda: None) -> list[Finding]:
         """The rules that hold for every dataset."""

@@ -34,7 +34,11 @@ def open_dataset(text: str | Path, **settings: Any) -> Dataset:
 
 
 def check_dataset(
-    text: str, results: Path | None = None, progress: Callable[[int], Callable[[], None]] | None = None, **settings: Any
+    text: str,
+    results: Path | None = None,
+    progress: Callable[[int], Callable[[], None]] | None = None,
+    tell: Callable[[Dataset], None] | None = None,
+    **settings: Any,
 ) -> list[Finding]:
     """What is wrong with a dataset, and with result files for it.
 
@@ -42,6 +46,7 @@ def check_dataset(
         text: names the dataset, see `open_dataset`.
         results: result files in its form, or None.
         progress: is told the number of frames and gives what to call after each.
+        tell: is given the dataset, if it can be opened, before it is checked.
         settings: settings of the kind; those that are None are left to it.
 
     Raises:
@@ -56,6 +61,8 @@ def check_dataset(
         if not any(finding.severity == "error" for finding in findings):
             raise
         return list(findings)
+    if tell is not None:
+        tell(dataset)
     return dataset.check(results, (lambda: None) if progress is None else progress(len(dataset)))
 
 

@@ -163,7 +163,7 @@ def read_coco_index(
 
     Args:
         path: JSON with ``categories`` and ``images``.
-        frames_of_files: (frame id, camera) by image file name; a path's last part is enough.
+        frames_of_files: (frame id, camera) by image path; of a file name, as many last parts as tell them apart.
 
     Raises:
         FormatError: not such a file.
@@ -208,6 +208,33 @@ def _frame_of(name: str, frames: Mapping[str, set[tuple[str, str]]], path: Path)
                 "into file_name"
             )
     return None
+
+
+def read_coco_annotations(
+    path: Path, class_names: Sequence[str], frames_of_files: Mapping[str, tuple[str, str]]
+) -> CameraDetections:
+    """2D boxes of a COCO file with ``images``, ``categories`` and ``annotations``; those without a score get 1.
+
+    Args:
+        path: the file.
+        class_names: classes to keep; others are left out.
+        frames_of_files: see `read_coco_index`.
+
+    Raises:
+        FormatError: not such a file, or none of its images is known.
+    """
+    categories, images = read_coco_index(path, frames_of_files)
+    records = read_json(path).get("annotations")
+    if not isinstance(records, list) or not all(isinstance(record, dict) for record in records):
+        raise FormatError(f"{path} must hold 'annotations', a list of records")
+    if not images:
+        raise FormatError(f"{path}: none of its images is one of the {len(frames_of_files)} of the dataset")
+    kept = [record for record in records if record.get("image_id") in images]
+    named = [{"score": 1.0, **r, "category_name": categories.get(r.get("category_id", -1), "")} for r in kept]
+    # polygons are no run-length masks
+    named = [{k: v for k, v in r.items() if k != "segmentation" or isinstance(v, dict)} for r in named]
+    looked_at = {place: Detections2D.empty(class_names) for place in images.values()}
+    return {**looked_at, **_group(path, named, lambda r: images[r["image_id"]], "category_name", class_names)}
 
 
 def _records(path: Path) -> list[dict[str, Any]]:
