@@ -8,8 +8,8 @@ import numpy as np
 
 from lcf3d.datasets.base import Dataset
 from lcf3d.structures import Detections3D, Frame
-from lcf3d.visualization.points import paint_points
 from lcf3d.visualization.png import draw_frame
+from lcf3d.visualization.points import paint_points
 from lcf3d.visualization.scene import Scene
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ def draw_check(dataset: Dataset) -> PIL.Image.Image:
         frame = dataset.frame(dataset.ids[0])
     images = {}
     for camera in frame.cameras:
-        image = frame.images[camera.name] if camera.name in frame.images else None
+        image = frame.images.get(camera.name)
         if image is None:
             image = np.full((camera.height, camera.width, 3), 40, np.uint8)
         images[camera.name] = image if frame.points is None else paint_points(image, camera, frame.points)

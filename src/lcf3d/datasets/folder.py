@@ -24,6 +24,9 @@ from lcf3d.formats.point_files import SUFFIXES, read_scan
 from lcf3d.geometry.rotation import invert_rigid, rigid_transforms
 from lcf3d.structures import Camera, Detections3D, FloatArray, Frame, Sweep
 
+# name of a sensor, folder and suffixes of its files, and where they are kept
+_Files = tuple[str, Path, tuple[str, ...], dict[str, dict[str, Path]]]
+
 
 class FolderDataset(BaseDataset):
     """Frames of a folder with a ``sensors.yaml``.
@@ -58,7 +61,9 @@ class FolderDataset(BaseDataset):
 
     def _join(self) -> tuple[str, ...]:
         """Files by sensor and frame; the frames are those of the first sensor."""
-        kinds = [(name, self.root / s.scans, SUFFIXES, self._scans) for name, s in self.sensors.lidars.items()]
+        kinds: list[_Files] = [
+            (name, self.root / s.scans, SUFFIXES, self._scans) for name, s in self.sensors.lidars.items()
+        ]
         kinds += [
             (name, self.root / s.images, IMAGE_SUFFIXES, self._images) for name, s in self.sensors.cameras.items()
         ]

@@ -222,7 +222,10 @@ def _check_poses(dataset: FolderFrames, evidence: _Evidence) -> list[Finding]:
         poor = given < (UPRIGHT if score is uprightness else _POOR)
         if not poor:
             continue
-        guesses = [(float(np.nan_to_num(score(guess.camera_from_lidar))), guess) for guess in pose_guesses(dataset.sensors, camera.name)]
+        guesses = [
+            (float(np.nan_to_num(score(guess.camera_from_lidar))), guess)
+            for guess in pose_guesses(dataset.sensors, camera.name)
+        ]
         best, guess = max(guesses, key=lambda pair: (round(pair[0], 2), -guesses.index(pair)))
         asked = f"camera {camera.name}: {measure} {given:.2f} as its pose is"
         if best > max(UPRIGHT if score is uprightness else _POOR, _BETTER * given):

@@ -32,7 +32,9 @@ def write_folder(frames: Iterable[Frame], root: Path, image_format: Literal["png
     """
     ids: list[str] = []
     cameras: dict[str, Camera] = {}
-    times, poses, classes = [], [], ()
+    times: list[str] = []
+    poses: list[str] = []
+    classes: tuple[str, ...] = ()
     has = {"lidar": False, "labels": False}
     for frame in frames:
         ids.append(frame.id)

@@ -30,6 +30,8 @@ UPRIGHT = 0.5
 
 _NEAR_M = 30.0
 _GROUND_BIN_M = 0.2
+# ground lies in boxes wherever they stand, and strewn points do too
+_LIFT_M, _HELD = 0.3, 3
 _DIRECTIONS = ("forward", "left", "up")
 _OPPOSITES = ("back", "right", "down")
 
@@ -96,12 +98,14 @@ def agreement(
 
 
 def filled_share(points: Sequence[NDArray[np.float32]], boxes: Sequence[FloatArray]) -> float:
-    """Share of near boxes that hold a point of their frame's scan; NaN without near boxes."""
-    held: list[bool] = []
+    """Share of near boxes that hold some points of their frame's scan above the ground; NaN without near boxes."""
+    held: list[float] = []
     for cloud, found in zip(points, boxes, strict=True):
         near = found[np.hypot(found[:, 0], found[:, 1]) < _NEAR_M]
         if len(near):
-            held += points_in_boxes(cloud, near).any(axis=1).tolist()
+            lifted = near + np.array([0, 0, _LIFT_M / 2, 0, 0, -_LIFT_M, 0])
+            counts = points_in_boxes(cloud, lifted).sum(axis=1)
+            held.extend((counts >= _HELD).astype(np.float64))
     return float(np.mean(held)) if held else float("nan")
 
 

@@ -63,9 +63,9 @@ def _pose(value: Any) -> list[list[float]]:
             matrix[:3, 3] = np.asarray(value["translation"], dtype=np.float64)
         else:
             numbers = np.asarray(value, dtype=np.float64).ravel()
-            matrix = np.vstack([numbers.reshape(-1, 4), np.eye(4)[3:]])[:4] if len(numbers) in (12, 16) else None
-            if matrix is None:
+            if len(numbers) not in (12, 16):
                 raise ValueError(f"a pose must be 12 or 16 numbers, got {len(numbers)}")
+            matrix = np.vstack([numbers.reshape(-1, 4), np.eye(4)[3:]])[:4]
     except TypeError:
         raise ValueError("a pose must be numbers") from None
     rotation = matrix[:3, :3]

@@ -17,8 +17,16 @@ class FolderContent(Protocol):
 
     ids: tuple[str, ...]
     sensors: Sensors
-    times: dict[str, float]
-    poses: dict[str, FloatArray]
+
+    @property
+    def times(self) -> dict[str, float]:
+        """Seconds by frame."""
+        ...
+
+    @property
+    def poses(self) -> dict[str, FloatArray]:
+        """``world_from_lidar`` by frame."""
+        ...
 
     @property
     def labels_from(self) -> FolderLabels | None:
