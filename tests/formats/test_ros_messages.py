@@ -8,7 +8,7 @@ from lcf3d.formats import ros_messages as ros
 from lcf3d.structures import Detections2D, Detections3D
 
 pytest.importorskip("rosbags")
-from tests.formats.ros_types import store
+from lcf3d.formats.ros_types import store
 
 NAMES = ("Car", "Pedestrian", "Cyclist")
 TYPES = store()

@@ -6,7 +6,7 @@ Messages are rosbags' classes; whatever is published goes through CDR, as the mi
 import sys
 from types import ModuleType, SimpleNamespace
 
-from tests.formats.ros_types import store
+from lcf3d.formats.ros_types import store
 
 TYPES = store()
 

@@ -15,6 +15,10 @@ if TYPE_CHECKING:
     from lcf3d.run.setup import Run
 
 
+# where a run's bag goes
+_BAGS = {"mcap": "fused.mcap", "rosbag2": "fused_bag", "rosbag1": "fused.bag"}
+
+
 def run(
     dataset: Annotated[str, typer.Argument(help="kitti:ROOT, nuscenes:ROOT or another installed kind")],
     lidar: Annotated[str, typer.Option(help="LiDAR detector, kind:argument, for example results:DIR")],
@@ -55,6 +59,9 @@ def run(
         bool, typer.Option("--smooth", help="as --memory, and later frames testify as well; not for live use")
     ] = False,
     jobs: Annotated[int, typer.Option(min=1, help="processes")] = 1,
+    format_: Annotated[
+        str | None, typer.Option("--format", help="also write a bag of sensors and fused boxes: mcap, rosbag2, rosbag1")
+    ] = None,
     pictures: Annotated[bool, typer.Option("--pictures", help="also draw every frame")] = False,
     resume: Annotated[bool, typer.Option("--resume", help="continue a run that was interrupted")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="replace the run that --out holds")] = False,
@@ -93,6 +100,8 @@ def run(
         memory=memory,
         smooth=smooth,
     )
+    if format_ not in (None, *_BAGS):
+        raise ConfigError(f"--format takes {', '.join(_BAGS)}, got {format_!r}")
     prepared = prepare_run(request, out, resume=resume, overwrite=overwrite)
     sequences = _sequences(prepared) if memory or smooth else None
     pending = (
@@ -102,6 +111,8 @@ def run(
     )
     summaries = _fuse(prepared, pending, jobs, sequences, quiet=json_)
     prepared.folder.finish(prepared.frame_ids)
+    if format_ is not None:
+        _write_bag(prepared, out / _BAGS[format_])
     if pictures:
         _draw(prepared, quiet=json_)
     counts = {
@@ -147,6 +158,18 @@ def _fuse(
             summaries.append(summary)
             progress.advance(task)
     return summaries
+
+
+def _write_bag(prepared: Run, path: Path) -> None:
+    """The sensors' data and the fused boxes as a bag; one that is there is replaced."""
+    import shutil
+
+    from lcf3d.datasets.bag_export import write_bag
+
+    if path.is_dir():
+        shutil.rmtree(path)
+    path.unlink(missing_ok=True)
+    write_bag(map(prepared.dataset.frame, prepared.frame_ids), path, prepared.folder.read)
 
 
 def _draw(prepared: Run, quiet: bool) -> None:

@@ -13,7 +13,7 @@ from lcf3d.errors import ConfigError
 from lcf3d.files import atomic_path, write_text
 from lcf3d.formats.plain import write_detections_3d
 from lcf3d.geometry.rotation import quaternions_from_matrices
-from lcf3d.structures import Camera, Frame
+from lcf3d.structures import Camera, FloatArray, Frame
 
 
 def write_folder(frames: Iterable[Frame], root: Path, image_format: Literal["png", "jpg", "webp"] = "png") -> list[str]:
@@ -73,10 +73,18 @@ def write_folder(frames: Iterable[Frame], root: Path, image_format: Literal["png
     return ids
 
 
-def _setup(camera: Camera) -> CameraSetup:
+def pose_without_offset(camera: Camera) -> FloatArray:
+    """(4, 4) ``camera_from_lidar`` with which ``[K | 0]`` projects as the camera does.
+
+    A stereo baseline in the last column of the projection goes into the pose.
+    """
     pose = np.array(camera.camera_from_lidar)
-    # a stereo baseline in the last column of the projection goes into the pose
     pose[:3, 3] += np.linalg.solve(camera.intrinsics, camera.projection[:, 3])
+    return pose
+
+
+def _setup(camera: Camera) -> CameraSetup:
+    pose = pose_without_offset(camera)
     lens = camera.distortion
     return CameraSetup.model_validate(
         {

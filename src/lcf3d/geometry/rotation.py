@@ -88,3 +88,17 @@ def transform_points(points: FloatArray, target_from_source: FloatArray) -> Floa
     rotation, translation = target_from_source[..., :3, :3], target_from_source[..., :3, 3]
     moved: FloatArray = np.einsum("...ij,...j->...i", rotation, points) + translation
     return moved
+
+
+def interpolated(first: FloatArray, second: FloatArray, share: float) -> FloatArray:
+    """The (4, 4) pose that lies ``share`` of the way between two; beyond 1 the motion is carried on.
+
+    The normalised line between the quaternions is the great circle to a hundredth of a degree for small turns.
+    """
+    q = quaternions_from_matrices(np.stack([first[:3, :3], second[:3, :3]]))
+    if q[0] @ q[1] < 0:
+        q[1] = -q[1]
+    turned = (1 - share) * q[0] + share * q[1]
+    moved = (1 - share) * first[:3, 3] + share * second[:3, 3]
+    pose: FloatArray = rigid_transforms(turned[None], moved[None])[0]
+    return pose

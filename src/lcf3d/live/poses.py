@@ -6,7 +6,7 @@ from bisect import bisect_left, insort
 
 import numpy as np
 
-from lcf3d.geometry.rotation import invert_rigid, quaternions_from_matrices, rigid_transforms
+from lcf3d.geometry.rotation import interpolated, invert_rigid
 from lcf3d.structures import Detections3D, FloatArray
 
 # beyond the newest pose the last motion is carried on for so long (seconds)
@@ -57,20 +57,6 @@ class PoseBuffer:
         """(4, 4) ``lidar_at_later_from_lidar_at_earlier``; None where a pose is missing."""
         first, second = self.at(earlier), self.at(later)
         return None if first is None or second is None else np.asarray(invert_rigid(second) @ first)
-
-
-def interpolated(first: FloatArray, second: FloatArray, share: float) -> FloatArray:
-    """The (4, 4) pose that lies ``share`` of the way between two; beyond 1 the motion is carried on.
-
-    The normalised line between the quaternions is the great circle to a hundredth of a degree for small turns.
-    """
-    q = quaternions_from_matrices(np.stack([first[:3, :3], second[:3, :3]]))
-    if q[0] @ q[1] < 0:
-        q[1] = -q[1]
-    turned = (1 - share) * q[0] + share * q[1]
-    moved = (1 - share) * first[:3, 3] + share * second[:3, 3]
-    pose: FloatArray = rigid_transforms(turned[None], moved[None])[0]
-    return pose
 
 
 def relative_velocities(lidar: Detections3D, motion: FloatArray, seconds: float) -> FloatArray:

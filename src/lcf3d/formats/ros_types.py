@@ -1,4 +1,10 @@
-"""Message types that rosbags does not bring: vision_msgs 4 and autoware_perception_msgs."""
+"""Message types that rosbags does not bring: vision_msgs 4, autoware_perception_msgs, tier4's regions of interest."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from lcf3d.errors import MissingExtraError
 
 DEFINITIONS = {
     "vision_msgs/msg/ObjectHypothesis": "string class_id\nfloat64 score\n",
@@ -35,16 +41,32 @@ DEFINITIONS = {
     "autoware_perception_msgs/msg/DetectedObjects": (
         "std_msgs/Header header\nautoware_perception_msgs/DetectedObject[] objects\n"
     ),
+    "tier4_perception_msgs/msg/Feature": "sensor_msgs/PointCloud2 cluster\nsensor_msgs/RegionOfInterest roi\n",
+    "tier4_perception_msgs/msg/DetectedObjectWithFeature": (
+        "autoware_perception_msgs/DetectedObject object\ntier4_perception_msgs/Feature feature\n"
+    ),
+    "tier4_perception_msgs/msg/DetectedObjectsWithFeature": (
+        "std_msgs/Header header\ntier4_perception_msgs/DetectedObjectWithFeature[] feature_objects\n"
+    ),
 }
 
 
-def store():
-    """A store of ROS 2 Humble's types and those above."""
-    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+_TF = {"tf2_msgs/msg/TFMessage": "geometry_msgs/TransformStamped[] transforms\n"}
 
-    types = get_typestore(Stores.ROS2_HUMBLE)
-    added = {}
-    for name, text in DEFINITIONS.items():
+
+def store(ros1: bool = False) -> Any:
+    """A rosbags type store of ROS 2 Humble's types (or ROS 1 Noetic's) and those above.
+
+    Raises:
+        MissingExtraError: rosbags is not installed.
+    """
+    try:
+        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+    except ImportError:
+        raise MissingExtraError("rosbags", "bag", "reading and writing bags") from None
+    types = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
+    added: dict[str, Any] = {}
+    for name, text in (DEFINITIONS | _TF if ros1 else DEFINITIONS).items():
         added.update(get_types_from_msg(text, name))
-    types.register(added)
+    types.register({name: fields for name, fields in added.items() if name not in types.fielddefs})
     return types
