@@ -21,8 +21,10 @@ from lcf3d.structures import (
 
 if TYPE_CHECKING:
     from lcf3d.api import draw, evaluate, read_run, run
+    from lcf3d.datasets.bag_export import write_bag
     from lcf3d.datasets.base import BaseDataset, Dataset
     from lcf3d.datasets.convert import write_kitti, write_nuscenes
+    from lcf3d.datasets.folder_export import write_folder
     from lcf3d.datasets.kitti import KittiDataset
     from lcf3d.datasets.nuscenes import NuscenesDataset
     from lcf3d.datasets.opening import open_dataset
@@ -102,6 +104,8 @@ _LAZY = {
     "to_classes": "detectors.classes",
     "write_detections_2d": "formats.plain",
     "write_detections_3d": "formats.plain",
+    "write_bag": "datasets.bag_export",
+    "write_folder": "datasets.folder_export",
     "write_kitti": "datasets.convert",
     "write_nuscenes": "datasets.convert",
 }
@@ -162,8 +166,10 @@ __all__ = [
     "run",
     "self_calibrate",
     "to_classes",
+    "write_bag",
     "write_detections_2d",
     "write_detections_3d",
+    "write_folder",
     "write_kitti",
     "write_nuscenes",
 ]

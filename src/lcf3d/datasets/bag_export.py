@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +14,11 @@ from lcf3d.formats import ros_messages as ros
 from lcf3d.formats.bag_files import BagWriter
 from lcf3d.geometry.rotation import invert_rigid, quaternions_from_matrices, quaternions_from_yaws
 from lcf3d.provenance import FusedDetections
-from lcf3d.structures import Camera, Detections3D, FloatArray, Frame
+from lcf3d.structures import Camera, Detections2D, Detections3D, FloatArray, Frame
 
 LIDAR, WORLD = "lidar", "world"
-POINTS, LABELS, FUSED, MARKERS = "/lidar/points", "/labels", "/fused/objects", "/fused/markers"
+POINTS, OBJECTS, LABELS = "/lidar/points", "/lidar/objects", "/labels"
+FUSED, MARKERS = "/fused/objects", "/fused/markers"
 PERIOD_S = 0.1
 """Time between frames that have none."""
 
@@ -28,17 +29,19 @@ def write_bag(
     frames: Iterable[Frame],
     path: Path,
     fused: Callable[[str], FusedDetections] | None = None,
+    detections: Callable[[Frame], tuple[Detections3D, Mapping[str, Detections2D]]] | None = None,
     quality: int | None = 90,
 ) -> int:
     """Write clouds, images, calibration, poses, labels and fused boxes, frame by frame.
 
     Topics: ``/lidar/points``, ``/CAMERA/image/compressed`` (or ``/CAMERA/image``), ``/CAMERA/camera_info``, ``/tf``,
-    ``/labels``, ``/fused/objects`` and, for viewers, ``/fused/markers``.
+    ``/labels``, ``/lidar/objects`` and ``/CAMERA/objects``, ``/fused/objects`` and, for viewers, ``/fused/markers``.
 
     Args:
         frames: of any dataset.
         path: ``.mcap``, ``.bag``, or a folder for rosbag2; must not exist.
         fused: gives the result of a frame, see `lcf3d.run.folder.RunFolder.read`.
+        detections: gives both branches of a frame, 3D and 2D by camera.
         quality: of JPEG images; None writes them raw, every pixel as it is.
 
     Returns:
@@ -57,6 +60,8 @@ def write_bag(
             if frame.labels is not None:
                 message = ros.vision_from_detections_3d(writer.make, frame.labels, seconds, LIDAR)
                 writer.write(LABELS, message, seconds)
+            if detections is not None:
+                _write_detections(writer, *detections(frame), seconds)
             if fused is not None:
                 found = fused(frame.id).detections
                 writer.write(FUSED, ros.vision_from_detections_3d(writer.make, found, seconds, LIDAR), seconds)
@@ -65,6 +70,14 @@ def write_bag(
     finally:
         writer.close()
     return count
+
+
+def _write_detections(
+    writer: BagWriter, lidar: Detections3D, cameras: Mapping[str, Detections2D], seconds: float
+) -> None:
+    writer.write(OBJECTS, ros.vision_from_detections_3d(writer.make, lidar, seconds, LIDAR), seconds)
+    for name, seen in cameras.items():
+        writer.write(f"/{name}/objects", ros.vision_from_detections_2d(writer.make, seen, seconds, name), seconds)
 
 
 def _write_sensors(writer: BagWriter, frame: Frame, seconds: float, quality: int | None) -> None:
