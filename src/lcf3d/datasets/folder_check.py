@@ -45,6 +45,8 @@ SAMPLE = 10
 # a pose is doubted below this agreement, and explained by one that agrees as much better
 _POOR, _BETTER = 0.3, 2.0
 _ABOVE_M = 0.5
+# guesses that agree so much alike cannot be told apart
+_ALIKE = 0.02
 
 
 class FolderFrames(Protocol):
@@ -107,7 +109,8 @@ def check_folder(
     except Lcf3dError as error:
         return [*findings, Finding("FRM01", "error", str(error)), *check_frames(dataset, results, progress)]
     ground = _check_ground(dataset, evidence)
-    labels = _check_labels(dataset, evidence)
+    # with the ground in the wrong place, labels say nothing more
+    labels = [] if ground else _check_labels(dataset, evidence)
     findings += ground + labels
     if not ground and not labels:
         findings += _check_poses(dataset, evidence)
@@ -226,10 +229,11 @@ def _check_poses(dataset: FolderFrames, evidence: _Evidence) -> list[Finding]:
             (float(np.nan_to_num(score(guess.camera_from_lidar))), guess)
             for guess in pose_guesses(dataset.sensors, camera.name)
         ]
-        best, guess = max(guesses, key=lambda pair: (round(pair[0], 2), -guesses.index(pair)))
+        best = max(value for value, _ in guesses)
+        fitting = " or ".join(guess.words for value, guess in guesses if value > best - _ALIKE)
         asked = f"camera {camera.name}: {measure} {given:.2f} as its pose is"
         if best > max(UPRIGHT if score is uprightness else _POOR, _BETTER * given):
-            findings.append(Finding("FLD02", "error", f"{asked}, {best:.2f} if {guess.words}"))
+            findings.append(Finding("FLD02", "error", f"{asked}, {best:.2f} if {fitting}"))
         else:
             unexplained = f"{asked}, and no likely mistake explains it (best {best:.2f})"
             findings.append(Finding("FLD02", "warning", unexplained))
