@@ -5,13 +5,15 @@ import shlex
 from importlib.metadata import EntryPoint
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 from typer.testing import CliRunner
 
 from lcf3d import plugins
 from lcf3d.cli.app import app
-from tests.datasets.plain_folder import write_plain_folder
+from lcf3d.datasets.folder import FolderDataset
+from tests.datasets.plain_folder import FRONT_FROM_LIDAR, write_plain_folder, write_sensors
 
 PAGE = (Path(__file__).parents[1] / "docs" / "my-own-data.md").read_text()
 
@@ -57,13 +59,12 @@ def test_the_tutorial_runs_as_it_stands(tmp_path, monkeypatch, capsys):
 
 def test_the_messages_that_the_page_shows_are_those_of_the_check(tmp_path):
     """Both mistakes of the page, made."""
-    import numpy as np
-
-    from lcf3d.datasets.folder import FolderDataset
-    from tests.datasets.plain_folder import FRONT_FROM_LIDAR, write_sensors
 
     root = write_plain_folder(tmp_path / "drive", frames=2)
     inverse = np.linalg.inv(FRONT_FROM_LIDAR).tolist()
     write_sensors(root, lambda values: values["cameras"]["front"].update(camera_from_lidar=inverse))
     shown = [f"{f.id} {f.severity}: {f.message}" for f in FolderDataset(root).check(root / "camera_results")]
     assert next(line for line in shown if line.startswith("FLD02")) in PAGE
+    write_sensors(root, lambda values: values["lidars"]["top"].update(axes="right-forward-up"))
+    shown = [f"{f.id} {f.severity}: {f.message}" for f in FolderDataset(root).check()]
+    assert next(line for line in shown if line.startswith("FLD04")) in PAGE

@@ -9,6 +9,7 @@ from lcf3d.datasets.folder_export import write_folder
 from lcf3d.datasets.folder_init import init_folder
 from lcf3d.datasets.folder_poses import AXES, axes_of
 from lcf3d.datasets.folder_sensors import canonical_from_axes
+from lcf3d.distortion import Distortion
 from lcf3d.errors import ConfigError, DatasetError, FormatError
 from lcf3d.files import write_json
 from lcf3d.formats.kitti import objects_from_detections, objects_from_detections_2d, write_objects
@@ -293,6 +294,19 @@ def test_init_writes_what_can_be_read(root):
     assert any("looks forward" in line for line in dataset.describe())
     with pytest.raises(ConfigError, match="exists; pass --overwrite"):
         init_folder(root)
+
+
+def test_lenses_are_read_and_written(root, tmp_path):
+    lens = {"model": "fisheye", "coefficients": [0.02, -0.004, 0.0, 0.0]}
+    write_sensors(root, lambda v: v["cameras"]["front"].update(distortion=lens))
+    write_folder(FolderDataset(root), tmp_path / "again", "webp")
+    for place in (root, tmp_path / "again"):
+        front, left = FolderDataset(place).cameras
+        assert front.distortion == Distortion("fisheye", (0.02, -0.004, 0.0, 0.0))
+        assert left.distortion is None
+    write_sensors(root, lambda v: v["cameras"]["front"].update(distortion={**lens, "coefficients": [1.0]}))
+    with pytest.raises(ConfigError, match="needs 4 coefficients"):
+        _ = FolderDataset(root).cameras
 
 
 def test_an_export_comes_back(root, tmp_path):
