@@ -245,9 +245,9 @@ def test_in_real_time_the_watch_has_a_thread_of_its_own():
     for message in messages:
         target.push(message)
     target.flush()
+    target.close()
     assert target.watch.report("left").frames >= 1
     assert target.watch.estimate("left").pairs > 0
-    target.close()
 
 
 def test_warm_up_runs_everything_without_a_result():
