@@ -26,6 +26,7 @@ VERBS: dict[str, str] = {
     "calibrate": "calibrate",
     "ablate": "ablate",
     "generalize": "generalize",
+    "paper": "paper",
 }
 # verbs with verbs of their own: module of lcf3d.cli that defines a typer app of that name
 GROUPS: dict[str, str] = {"train": "train"}
