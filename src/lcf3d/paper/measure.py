@@ -203,9 +203,9 @@ def kitti_figures(table: Table, dataset: str, frames: Sequence[str], results: Pa
         return _over_iou(table, data, frames, results)
     metrics = open_evaluation(data, frames).read(results, results.name).metrics  # type: ignore[attr-defined]
     ap = {(c, d): metrics.ap(c, "3d", d) for c in KITTI_NAMES for d in DIFFICULTIES if c in metrics.class_names}
-    figures: dict[str, float | None] = {f"{c} {d}": ap.get((c, d)) for c in KITTI_NAMES for d in DIFFICULTIES}
+    # the official program leaves out a class without any detection; here it counts as 0
+    figures: dict[str, float | None] = {f"{c} {d}": ap.get((c, d), 0.0) for c in KITTI_NAMES for d in DIFFICULTIES}
     for d in DIFFICULTIES:
-        # a class without any detection counts as 0
         figures[d] = float(np.mean([ap.get((c, d), 0.0) for c in KITTI_NAMES]))
     return figures
 
@@ -217,7 +217,7 @@ def _over_iou(table: Table, data: Any, frames: Sequence[str], results: Path) -> 
         options = EvaluationOptions(iou=tuple(f"{c}:3d={threshold}" for c in KITTI_NAMES))
         metrics = open_evaluation(data, frames, options).read(results, results.name).metrics  # type: ignore[attr-defined]
         for c in KITTI_NAMES:
-            figures[f"{c} {threshold}"] = metrics.ap(c, "3d", "moderate") if c in metrics.class_names else None
+            figures[f"{c} {threshold}"] = metrics.ap(c, "3d", "moderate") if c in metrics.class_names else 0.0
     return figures
 
 

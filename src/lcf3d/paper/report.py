@@ -43,11 +43,12 @@ def table_data(table: Table, rows: Sequence[Row], measured: Mapping[str, Measure
         ran = found is not None and any(v is not None for v in found.values)
         values = found.values if found else (None,) * len(table.columns)
         mark = " (quoted)" if row.quoted and not ran else ""
-        cells.append((row.name + mark, "paper", *(_number(v, digits) for v in row.values)))
+        cells.append((row.name + mark, *("" for _ in row.values)))
+        cells.append(("  paper", *(_number(v, digits) for v in row.values)))
         if ran:
             differences = [None if p is None or m is None else m - p for p, m in zip(row.values, values, strict=True)]
-            cells.append(("", "measured", *(_number(v, digits) for v in values)))
-            cells.append(("", "difference", *(_number(v, digits, sign=True) for v in differences)))
+            cells.append(("  measured", *(_number(v, digits) for v in values)))
+            cells.append(("  difference", *(_number(v, digits, sign=True) for v in differences)))
     return TableData(
         f"{table.name}: {table.title}", ("", "", *map(_short, table.columns)), cells, notes_of(rows, measured)
     )
@@ -78,5 +79,5 @@ def _number(value: float | None, digits: int, sign: bool = False) -> str:
 
 
 def _short(column: str) -> str:
-    """A heading in two lines, each of seven letters at most."""
-    return "\n".join(word[:4] if len(word) > 7 else word for word in column.replace("_", " ").split())
+    """A heading of short lines."""
+    return "\n".join(word if len(word) <= 5 else f"{word[:4]}." for word in column.replace("_", " ").split())
