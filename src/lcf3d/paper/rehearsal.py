@@ -55,7 +55,7 @@ def _state(name: str) -> dict[str, Any]:
             if parameter.endswith("bn3.weight"):
                 value.zero_()
             elif parameter.endswith("fc_cls.weight"):
-                value.mul_(50.0)
+                value.mul_(150.0)
         return state
     if sensor == "localizer":
         from lcf3d.localizers.pointnet2 import FrustumPointNet2
@@ -70,8 +70,10 @@ def _state(name: str) -> dict[str, Any]:
     config = PRESETS[name]
     network = detector_class(config.architecture).build(config)
     for parameter, module in network.named_modules():
-        # few of the many anchors score, but some do
+        # gains that keep activations from fading, and few of the many anchors score, but some do
+        if isinstance(module, torch.nn.BatchNorm1d | torch.nn.BatchNorm2d) and module.weight is not None:
+            torch.nn.init.constant_(module.weight, 2.4)
         if parameter.endswith(("conv_cls", "heatmap.1")) and getattr(module, "bias", None) is not None:
-            torch.nn.init.constant_(module.bias, -2.5)
+            torch.nn.init.constant_(module.bias, -2.2)
     state = network.state_dict()
     return state
