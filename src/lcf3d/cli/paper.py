@@ -11,8 +11,8 @@ import typer
 from lcf3d.errors import ConfigError, Lcf3dError
 
 if TYPE_CHECKING:
-    from lcf3d.paper.measure import Measured, Workplace
     from lcf3d.paper.tables import Row, Table
+    from lcf3d.paper.workplace import Measured, Workplace
 
 
 def paper(
@@ -96,8 +96,8 @@ def _measure(
 
     from lcf3d.cli.console import print_table
     from lcf3d.files import write_json, write_text
-    from lcf3d.paper.measure import Workplace
     from lcf3d.paper.report import markdown, table_data, to_json
+    from lcf3d.paper.workplace import Workplace
 
     contents = []
     with Progress(console=Console(stderr=True), disable=json_ or dry, transient=True) as progress:
@@ -147,8 +147,9 @@ def _given(table: Table, results: list[str] | None) -> dict[str, Path]:
 
 def _measured(table: Table, rows: tuple[Row, ...], place: Workplace) -> dict[str, Measured]:
     """All rows, those that cannot be measured with the reason."""
-    from lcf3d.paper.measure import measure_row, without_values
+    from lcf3d.paper.measure import measure_row
     from lcf3d.paper.networks import NeedsError
+    from lcf3d.paper.workplace import without_values
 
     if table.measure == "cost":
         from lcf3d.paper.cost import cost_rows, measure_costs
@@ -169,7 +170,7 @@ def _measured(table: Table, rows: tuple[Row, ...], place: Workplace) -> dict[str
 
 def _needs(table: Table, rows: tuple[Row, ...]) -> dict[str, Measured]:
     """What each row would need."""
-    from lcf3d.paper.measure import without_values
+    from lcf3d.paper.workplace import without_values
 
     return {r.name: without_values(table, r.quoted or r.needs or f"needs {', '.join(r.networks)}") for r in rows}
 

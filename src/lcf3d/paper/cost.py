@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
-from lcf3d.paper.measure import Measured
 from lcf3d.paper.networks import NeedsError
 from lcf3d.paper.tables import Row, Table
+from lcf3d.paper.workplace import Measured
 
 LIDAR, CAMERA, MATCHING, RECOVERY, SEMANTIC, WHOLE = range(6)
 """Rows that are measured, in the order of the table; those of other systems follow."""

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,65 +13,16 @@ from lcf3d.evaluation.protocol import EvaluationOptions, open_evaluation
 from lcf3d.files import read_json, write_json
 from lcf3d.paper.kept import keep_detections
 from lcf3d.paper.networks import NeedsError, branches, substitutes
+from lcf3d.paper.shift import measure_shift
 from lcf3d.paper.splits import KITTI_VAL
 from lcf3d.paper.tables import Row, Table
+from lcf3d.paper.workplace import Measured, Workplace, root_of, run_name, settings_of
 from lcf3d.run.frames import run_frames
 from lcf3d.run.frames import total as count_frames
 from lcf3d.run.setup import RunRequest, prepare_run
 
 DIFFICULTIES = ("easy", "moderate", "hard")
 KITTI_NAMES = ("Car", "Pedestrian", "Cyclist")
-
-# a LiDAR branch alone goes through the same run, which then changes nothing: no overlap is higher than 1
-_ALONE = (
-    "unmatched=keep",
-    "out_of_view=keep",
-    "ensemble=none",
-    "recovery=false",
-    "cluster_iou=1",
-    "lidar_score_threshold=0",
-    "camera_score_threshold=0.1",
-)
-
-Advance = Callable[[], None]
-
-
-@dataclass(frozen=True)
-class Workplace:
-    """Where the paper is measured.
-
-    Attributes:
-        out: folder of the tables; runs lie in ``runs`` below it.
-        roots: folder by kind of dataset, ``kitti`` or ``nuscenes``, of those that are there.
-        uses: what stands for the paper's networks, see `lcf3d.paper.networks.spec_of`.
-        results: result files of systems by name of the row, measured instead of running them.
-        device: torch device of the networks.
-        overwrite: begin runs anew that were made with other settings or inputs.
-        begin: is told what begins and of how many frames, and gives what to call after each.
-    """
-
-    out: Path
-    roots: Mapping[str, Path]
-    uses: Mapping[str, str] = field(default_factory=dict)
-    results: Mapping[str, Path] = field(default_factory=dict)
-    device: str = "cpu"
-    overwrite: bool = False
-    begin: Callable[[str, int], Advance] = lambda name, frames: lambda: None
-
-
-@dataclass(frozen=True)
-class Measured:
-    """What came of a row.
-
-    Attributes:
-        values: by column, None where it cannot be measured.
-        frames: how many it was measured on.
-        notes: what a reader has to know.
-    """
-
-    values: tuple[float | None, ...]
-    frames: int = 0
-    notes: tuple[str, ...] = ()
 
 
 def measure_row(table: Table, row: Row, place: Workplace) -> Measured:
@@ -87,8 +37,6 @@ def measure_row(table: Table, row: Row, place: Workplace) -> Measured:
     if row.quoted or not row.lidar:
         raise NeedsError(row.quoted or row.needs)
     if table.measure.startswith("shift"):
-        from lcf3d.paper.shift import measure_shift
-
         return measure_shift(table, row, place)
     lidar, camera, localizer = branches(row, place.uses, place.device)
     kind = table.data[0]
@@ -108,36 +56,6 @@ def measure_row(table: Table, row: Row, place: Workplace) -> Measured:
     median_ms = _run(request, folder, row.name, place)
     words = tuple(f"with {text}" for text in substitutes(row, place.uses))
     return _evaluated(table, place, folder, _frames_a_second(table, median_ms), (*notes, *words))
-
-
-def settings_of(table: Table, row: Row) -> tuple[str, ...]:
-    """The changes to the paper's preset that make the row's run."""
-    if not row.camera:
-        return _ALONE
-    cascade = () if row.lidar_used else ("lidar_score_threshold=1",)
-    changes = {text.partition("=")[0]: text for text in (*table.changes, *row.changes, *cascade)}
-    if changes.get("recovery") == "recovery=false":
-        changes.pop("enlargement", None)
-    return tuple(changes.values())
-
-
-def run_name(table: Table, row: Row) -> str:
-    """Folder name of a row's run: rows of different tables that run the same share it."""
-    parts = [*row.networks, *(["stereo"] if row.stereo else []), *(settings_of(table, row) if row.camera else [])]
-    return "+".join(parts).replace("/", "-")
-
-
-def root_of(kind: str, place: Workplace) -> Path:
-    """The folder of a dataset.
-
-    Raises:
-        NeedsError: it was not named; says how large it is.
-    """
-    from lcf3d.paper.estimates import DATA
-
-    if kind not in place.roots:
-        raise NeedsError(f"--{kind} FOLDER: {DATA[kind]}")
-    return place.roots[kind]
 
 
 def frames_of(kind: str, root: Path) -> tuple[tuple[str, ...], tuple[str, ...]]:
@@ -227,13 +145,3 @@ def nuscenes_figures(table: Table, dataset: str, frames: Sequence[str], results:
     metrics = evaluation.read(results, results.name).official  # type: ignore[attr-defined]
     by_class = {name: float(aps.mean()) for name, aps in zip(metrics.class_names, metrics.aps, strict=True)}
     return {"mAP": metrics.mean_ap, "NDS": metrics.nd_score, **by_class}
-
-
-def without_values(table: Table, note: str) -> Measured:
-    """A row that could not be measured, and why."""
-    return Measured((None,) * len(table.columns), 0, (note,))
-
-
-def with_note(measured: Measured, note: str) -> Measured:
-    """The same with one note more."""
-    return replace(measured, notes=(*measured.notes, note))

@@ -6,14 +6,14 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from lcf3d import plugins
-from lcf3d.detectors.published import find_model
+from lcf3d.detectors.published import KINDS, find_model
 from lcf3d.errors import ConfigError, Lcf3dError
 from lcf3d.paper.tables import Row, paper_tables
 
 GROUPS = {"lidar": "lcf3d.lidar_detectors", "camera": "lcf3d.camera_detectors", "localizer": "lcf3d.localizers"}
 
 # LiDAR kinds that know the setting nms; alone, a network is measured after its own suppression
-_TORCH = ("pointpillars", "second", "ssn", "centerpoint", "part-a2", "pv-rcnn")
+_TORCH = KINDS
 _SUPPRESSES = (*_TORCH, "shipped", "onnx-lidar")
 
 

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from lcf3d.evaluation.protocol import TableData
-from lcf3d.paper.measure import Measured
 from lcf3d.paper.tables import Row, Table
+from lcf3d.paper.workplace import Measured
 
 
 def to_json(table: Table, rows: Sequence[Row], measured: Mapping[str, Measured]) -> dict[str, Any]:

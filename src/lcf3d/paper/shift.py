@@ -11,9 +11,9 @@ from lcf3d.evaluation.domain_shift import IOU_THRESHOLDS
 from lcf3d.evaluation.domain_tasks import FUSED, LIDAR_ALONE, DomainTask, DomainTaskRunner
 from lcf3d.files import read_json, write_json
 from lcf3d.fusion.config import FusionConfig
-from lcf3d.paper.measure import Measured, Workplace, root_of, run_name
 from lcf3d.paper.networks import branches, substitutes
 from lcf3d.paper.tables import Row, Table
+from lcf3d.paper.workplace import Measured, Workplace, root_of, run_name
 
 
 def measure_shift(table: Table, row: Row, place: Workplace) -> Measured:
