@@ -15,7 +15,7 @@ def clocs(
     out: Annotated[Path, typer.Option(help="file for the networks")] = Path("clocs.json"),
     split: Annotated[str | None, typer.Option(help="split of the dataset; the usual one if left out")] = None,
     folds: Annotated[int, typer.Option(min=0, help="also cross-validate in so many parts; 0 for none")] = 5,
-    steps: Annotated[int | None, typer.Option(min=1, help="batches of each network; 3,000 if left out")] = None,
+    steps: Annotated[int | None, typer.Option(min=1, help="batches of each network; 1,000 if left out")] = None,
     seed: Annotated[int, typer.Option(min=0, help="of weights and batches")] = 0,
 ) -> None:
     """Train CLOCs, learned fusion of 3D and 2D candidates, and cross-validate it beside the LiDAR branch alone.

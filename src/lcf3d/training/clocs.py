@@ -19,7 +19,7 @@ from lcf3d.fusion.clocs import WIDTHS, ClocsFusion, ClocsNetwork, Pairs, ScoreSc
 from lcf3d.structures import BoolArray, FloatArray, IntArray
 from lcf3d.training.loop import TrainingSettings, train
 
-SETTINGS = TrainingSettings(steps=3000, learning_rate=3e-3, weight_decay=1e-4, average=0.99, checkpoint_every=3000)
+SETTINGS = TrainingSettings(steps=1000, learning_rate=3e-3, weight_decay=1e-4, average=0.99, checkpoint_every=1000)
 """Of each class's network; the highest learning rate is that of the authors' release."""
 
 FRAMES_A_BATCH = 32
