@@ -26,9 +26,9 @@ CPU_SECONDS = {
     "pointpillars-nuscenes": 0.56,
     "ssn-regnet-nuscenes": 0.74,
     "centerpoint-voxel01-nuscenes": 1.14,
-    "fasterrcnn-r101-kitti": 4.2,
+    "fasterrcnn-r101-kitti": 2.6,
 }
-"""Seconds a frame (an image) on two CPU cores: LiDAR networks as docs/results.md has them."""
+"""Seconds a frame on two CPU cores: LiDAR networks as docs/results.md has them; an image takes 5.2 s of one core."""
 
 GPU_SECONDS = {"pointpillars-kitti": 0.016, "fasterrcnn-r101-kitti": 0.027, "pv-rcnn-kitti": 0.068}
 """Seconds a frame on an A100: the paper's table of complexity, and what its speeds say of PV-RCNN."""
