@@ -23,6 +23,7 @@ FLOORS = (
     ("run",),
     ("live",),
     ("evaluation",),
+    ("paper",),
     ("simulation",),
     ("benchmark",),
     ("demo",),

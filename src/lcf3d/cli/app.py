@@ -27,6 +27,8 @@ VERBS: dict[str, str] = {
     "calibrate": "calibrate",
     "ablate": "ablate",
     "generalize": "generalize",
+    "paper": "paper",
+    "submit": "submit",
 }
 # verbs with verbs of their own: module of lcf3d.cli that defines a typer app of that name
 GROUPS: dict[str, str] = {"train": "train"}

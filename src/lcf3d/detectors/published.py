@@ -268,6 +268,14 @@ PUBLISHED: tuple[PublishedModel, ...] = (
         note=_AUTHORS,
     ),
     PublishedModel(
+        "detectors-nuimages",
+        "",
+        "nuScenes: DetectoRS, with masks",
+        sensor="camera",
+        use="--camera mmdet:CONFIG,FILE",
+        note=_AUTHORS,
+    ),
+    PublishedModel(
         "frustum-pointnet-kitti",
         "",
         "KITTI: the localizer",

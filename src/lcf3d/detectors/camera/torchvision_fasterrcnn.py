@@ -134,7 +134,7 @@ class FasterRCNNNetwork(nn.Module):
         regions = self.propose(maps, height, width)
         logits, residuals = self.roi_head.bbox_head(roi_features(maps[:4], regions, STRIDES))
         scales = residuals.new_tensor([0.1, 0.1, 0.2, 0.2])
-        residuals = residuals.reshape(len(regions), -1, 4) * scales
+        residuals = residuals.reshape(len(regions), residuals.shape[1] // 4, 4) * scales
         boxes = decode_boxes(regions[:, None].expand_as(residuals), residuals)
         return logits.softmax(dim=1)[:, :-1], clip_boxes(boxes, height, width)
 

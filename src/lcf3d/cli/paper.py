@@ -1,0 +1,209 @@
+"""``lcf3d paper``: the paper's tables beside what is measured on this machine."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from lcf3d.errors import ConfigError, Lcf3dError
+
+if TYPE_CHECKING:
+    from lcf3d.paper.tables import Row, Table
+    from lcf3d.paper.workplace import Measured, Workplace
+
+
+def paper(
+    table: Annotated[str, typer.Argument(help="list, splits, all, or one of the list, for example table-1")] = "list",
+    out: Annotated[Path, typer.Option(help="folder for the tables and the runs behind them")] = Path("tables"),
+    kitti: Annotated[Path | None, typer.Option(help="folder of KITTI's object benchmark")] = None,
+    nuscenes: Annotated[Path | None, typer.Option(help="folder of nuScenes")] = None,
+    row: Annotated[
+        list[str] | None, typer.Option(help="only the row of which this is the name or its beginning; repeatable")
+    ] = None,
+    use: Annotated[
+        list[str] | None,
+        typer.Option(help="what stands for a network: NAME=FILE of weights, or NAME=kind:ARGUMENT; repeatable"),
+    ] = None,
+    results: Annotated[
+        list[str] | None, typer.Option(help="result files of any row's system, NAME=DIR; one table; repeatable")
+    ] = None,
+    rehearse: Annotated[
+        bool, typer.Option("--rehearse", help="weights filled by rule for all networks: do all steps run here?")
+    ] = False,
+    device: Annotated[str, typer.Option(help="of the networks: cpu or cuda")] = "cpu",
+    dry: Annotated[bool, typer.Option("--dry", help="run nothing: the numbers, and what would be needed")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="begin runs anew that had other inputs")] = False,
+    json_: Annotated[bool, typer.Option("--json", help="print JSON")] = False,
+) -> None:
+    """Print a table of the paper beside what is measured here: paper, measured, difference.
+
+    What is missing is run with the paper's settings, and an interrupted run goes on. Rows that cannot be measured say
+    what they need.
+
+    lcf3d paper list                                          the tables, what they need, about how long they take
+
+    lcf3d paper table-1 --kitti KITTI --out tables            published weights are downloaded at first use
+
+    lcf3d paper table-2 --kitti KITTI --results LoGoNet=DIR   fills the row of a quoted system
+
+    lcf3d paper splits --out KITTI/ImageSets                  train.txt and val.txt of the usual split
+    """
+    from lcf3d.files import write_text
+    from lcf3d.paper.networks import parse_uses
+    from lcf3d.paper.tables import find_table, paper_tables
+
+    if table == "list":
+        return _print_list(json_)
+    if table == "splits":
+        from lcf3d.paper.splits import KITTI_TRAIN, KITTI_VAL
+
+        for name, ids in (("train", KITTI_TRAIN), ("val", KITTI_VAL)):
+            write_text(out / f"{name}.txt", "".join(f"{frame_id}\n" for frame_id in ids))
+        return typer.echo(f"wrote {out / 'train.txt'} ({len(KITTI_TRAIN):,} frames) and val.txt ({len(KITTI_VAL):,})")
+    tables = list(paper_tables().values()) if table == "all" else [find_table(table)]
+    if len(tables) > 1 and (row or results):
+        raise ConfigError("--row and --results are for one table; name it")
+    uses = parse_uses(tuple(use or ()))
+    if rehearse:
+        from lcf3d.paper.rehearsal import filled_weights
+
+        names = {name for one in tables for r in _chosen(one, row) for name in r.networks}
+        uses = {**filled_weights(sorted(names - set(uses)), out / "rehearsal"), **uses}
+    roots = {k: v.expanduser() for k, v in (("kitti", kitti), ("nuscenes", nuscenes)) if v is not None}
+    return _measure(tables, row, results, roots, uses, out, device, dry, overwrite, json_)
+
+
+def _measure(
+    tables: list[Table],
+    names: list[str] | None,
+    results: list[str] | None,
+    roots: Mapping[str, Path],
+    uses: Mapping[str, str],
+    out: Path,
+    device: str,
+    dry: bool,
+    overwrite: bool,
+    json_: bool,
+) -> None:
+    """Measure, print and write tables one after the other."""
+    import json
+
+    from rich.console import Console
+    from rich.progress import Progress
+
+    from lcf3d.cli.console import print_table
+    from lcf3d.files import write_json, write_text
+    from lcf3d.paper.report import markdown, table_data, to_json
+    from lcf3d.paper.workplace import Workplace
+
+    contents = []
+    with Progress(console=Console(stderr=True), disable=json_ or dry, transient=True) as progress:
+
+        def begin(name: str, frames: int) -> Callable[[], None]:
+            bar = progress.add_task(name, total=frames)
+            return lambda: progress.advance(bar)
+
+        for one in tables:
+            place = Workplace(out, roots, uses, _given(one, results), device, overwrite, begin)
+            rows = _chosen(one, names)
+            measured = _needs(one, rows) if dry else _measured(one, rows, place)
+            contents.append(to_json(one, rows, measured))
+            data = table_data(one, rows, measured)
+            if not dry:
+                write_json(out / f"{one.name}.json", contents[-1])
+                write_text(out / f"{one.name}.md", markdown(data))
+            if not json_:
+                progress.stop()
+                print_table(data)
+    if json_:
+        typer.echo(json.dumps(contents if len(contents) > 1 else contents[0], indent=2))
+
+
+def _chosen(table: Table, names: list[str] | None) -> tuple[Row, ...]:
+    from lcf3d.paper.tables import find_row
+
+    return tuple(find_row(table, name) for name in names) if names else table.rows
+
+
+def _given(table: Table, results: list[str] | None) -> dict[str, Path]:
+    """Result files by name of the row."""
+    from lcf3d.paper.tables import find_row
+
+    found = {}
+    for item in results or ():
+        name, equals, path = item.partition("=")
+        if not equals or not path:
+            raise ConfigError(f"--results takes NAME=DIR, for example LoGoNet=results/logonet, got {item!r}")
+        if table.measure not in ("kitti", "nuscenes"):
+            raise ConfigError(f"{table.name} takes no --results: it needs more than boxes, or boxes of several runs")
+        if not Path(path).expanduser().exists():
+            raise ConfigError(f"--results {item}: there is no {path}")
+        found[find_row(table, name).name] = Path(path).expanduser()
+    return found
+
+
+def _measured(table: Table, rows: tuple[Row, ...], place: Workplace) -> dict[str, Measured]:
+    """All rows, those that cannot be measured with the reason."""
+    from lcf3d.paper.measure import measure_row
+    from lcf3d.paper.networks import NeedsError
+    from lcf3d.paper.workplace import without_values
+
+    if table.measure == "cost":
+        from lcf3d.paper.cost import cost_rows, measure_costs
+
+        return cost_rows(table, rows, measure_costs(_fusion_ms, place.device), place.device)
+    measured = {}
+    for row in rows:
+        try:
+            measured[row.name] = measure_row(table, row, place)
+        except NeedsError as error:
+            measured[row.name] = without_values(table, f"needs {error}" if not row.quoted else str(error))
+        except ConfigError:
+            raise
+        except Lcf3dError as error:
+            measured[row.name] = without_values(table, f"not measured: {error}")
+    return measured
+
+
+def _needs(table: Table, rows: tuple[Row, ...]) -> dict[str, Measured]:
+    """What each row would need."""
+    from lcf3d.paper.workplace import without_values
+
+    return {r.name: without_values(table, r.quoted or r.needs or f"needs {', '.join(r.networks)}") for r in rows}
+
+
+def _fusion_ms() -> dict[str, float]:
+    from lcf3d.benchmark.fusion import bench_fusion
+
+    found = {timing.name: timing.median_ms for timing in bench_fusion(0.5)}
+    names = {
+        "matching": "bounding box matching, 200 x 20",
+        "recovery": "detection recovery, 5 frustums, network",
+        "semantic": "semantic fusion, 40 matches",
+    }
+    return {short: found[name] for short, name in names.items()}
+
+
+def _print_list(json_: bool) -> None:
+    """The tables, what they are measured on and about how long that takes."""
+    import json
+    from dataclasses import asdict
+
+    from lcf3d.paper.estimates import DATA, about
+    from lcf3d.paper.tables import paper_tables
+
+    tables = paper_tables()
+    if json_:
+        typer.echo(json.dumps([asdict(one) for one in tables.values()], indent=2))
+        return
+    for one in tables.values():
+        numbers = sum(value is not None for r in one.rows for value in r.values)
+        typer.echo(f"{one.name}   {one.title}")
+        typer.echo(f"    {len(one.rows)} rows, {numbers} numbers; {one.place}")
+        needs = " and ".join(f"--{kind}" for kind in one.data) or "no data"
+        typer.echo(f"    measured with {needs}; {about(one, one.rows) or 'minutes'}")
+    for kind, text in DATA.items():
+        typer.echo(f"--{kind}: {text}")

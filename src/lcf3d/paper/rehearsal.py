@@ -1,0 +1,79 @@
+"""Weights filled by rule, in place of trained ones, to see that every step of a table runs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from lcf3d.detectors.published import find_model
+from lcf3d.files import atomic_path
+from lcf3d.networks.torch import torch
+
+# the camera networks that have no readable form here are rehearsed as one that finds the same classes
+_CAMERAS = {
+    "fasterrcnn-r101-kitti": (101, "kitti", False),
+    "fasterrcnn-r50-nuscenes": (50, "nuscenes", False),
+    "ddq-detr-nuscenes": (50, "nuscenes", False),
+    "detectors-nuimages": (50, "nuscenes", True),
+}
+
+
+def filled_weights(names: Sequence[str], folder: Path) -> dict[str, str]:
+    """Checkpoint files of networks with fixed random weights; what each name stands for (see `spec_of`).
+
+    Args:
+        names: published names, see `lcf3d.detectors.published`.
+        folder: where the files are kept; those that are there are taken.
+    """
+    return {name: _filled(name, folder / f"{name}.pth") for name in names}
+
+
+def _filled(name: str, path: Path) -> str:
+    if not path.is_file():
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(0)
+            state = _state(name)
+        with atomic_path(path) as temporary:
+            torch.save({"state_dict": state}, temporary)
+    if name in _CAMERAS:
+        return f"fasterrcnn:{path}"
+    return str(path)
+
+
+def _state(name: str) -> dict[str, Any]:
+    """Parameters of an untrained network that finds something."""
+    sensor = find_model(name).sensor
+    if sensor == "camera":
+        from lcf3d.detectors.camera.torchvision_fasterrcnn import FasterRCNNNetwork
+        from lcf3d.detectors.camera.torchvision_styles import STYLES
+
+        depth, style, masks = _CAMERAS[name]
+        state: dict[str, Any] = FasterRCNNNetwork(depth, STYLES[style], masks).state_dict()
+        for parameter, value in state.items():
+            # residual blocks that add nothing keep activations finite; large class weights make scores differ
+            if parameter.endswith("bn3.weight"):
+                value.zero_()
+            elif parameter.endswith("fc_cls.weight"):
+                value.mul_(150.0)
+        return state
+    if sensor == "localizer":
+        from lcf3d.localizers.pointnet2 import FrustumPointNet2
+        from lcf3d.localizers.spec import LocalizerSpec
+
+        data = "kitti" if "kitti" in name else "nuscenes"
+        state = FrustumPointNet2(LocalizerSpec.of("v2", data)).state_dict()
+        return state
+    from lcf3d.detectors.lidar.loading import detector_class
+    from lcf3d.detectors.lidar.presets import PRESETS
+
+    config = PRESETS[name]
+    network = detector_class(config.architecture).build(config)
+    for parameter, module in network.named_modules():
+        # gains that keep activations from fading, and few of the many anchors score, but some do
+        if isinstance(module, torch.nn.BatchNorm1d | torch.nn.BatchNorm2d) and module.weight is not None:
+            torch.nn.init.constant_(module.weight, 2.4)
+        if parameter.endswith(("conv_cls", "heatmap.1")) and getattr(module, "bias", None) is not None:
+            torch.nn.init.constant_(module.bias, -2.2)
+    state = network.state_dict()
+    return state
