@@ -129,12 +129,12 @@ def _origins(evaluator: KittiEvaluator, provenance: Mapping[str, FusedDetections
                 lowered = table.reason[row] == Reason.DOWNWEIGHTED
                 name = "downweighted" if lowered else Outcome(table.outcome[row]).name.lower()
                 names[table.output[row]] = name
-        for row, output in _same_detections(results[f], fused):
+        for row, output in same_detections(results[f], fused):
             origins[results.starts[f] + row] = names[output]
     return origins
 
 
-def _same_detections(objects: KittiObjects, fused: FusedDetections) -> list[tuple[int, int]]:
+def same_detections(objects: KittiObjects, fused: FusedDetections) -> list[tuple[int, int]]:
     """Pairs (result line, fused output): the writer may leave outputs out and rounds scores, but keeps their order."""
     pairs: list[tuple[int, int]] = []
     first = 0
