@@ -75,6 +75,8 @@ def html_report(
         title=title,
         introduction=_introduction(studies),
         sections=sections,
+        body_of=_body,
+        foot_of=_foot,
         names=[study.name for study in studies],
         comparison=comparison,
         reach=_reach(comparison),
@@ -188,6 +190,22 @@ def _fusion_tables(study: Study, studies: Sequence[Study]) -> list[TableData]:
             list(misses),
         ),
     ]
+
+
+def _body(table: TableData) -> list[tuple[str, ...]]:
+    """Rows up to the one that sums up; a first cell left empty says what the row above says, so that rows can move."""
+    rows: list[tuple[str, ...]] = []
+    for row in table.rows:
+        if row is None:
+            break
+        rows.append((rows[-1][0], *row[1:]) if rows and not row[0] else row)
+    return rows
+
+
+def _foot(table: TableData) -> list[tuple[str, ...]]:
+    """The rows that sum up."""
+    place = table.rows.index(None) if None in table.rows else len(table.rows)
+    return [row for row in table.rows[place:] if row is not None]
 
 
 def _ratio(count: int, total: int) -> str:

@@ -1,4 +1,4 @@
-"""What the report's page works on, as plain JSON values: curves, the boxes of every frame, and the worst frames whole."""
+"""What the report's page works on, as plain JSON values: curves, the boxes of every frame, the worst frames whole."""
 
 from __future__ import annotations
 
@@ -37,9 +37,10 @@ class Names:
     """Numbers for names, in the order in which they come."""
 
     def __init__(self, names: Sequence[str] = ()) -> None:
-        self.numbers = {name: number for number, name in enumerate(names)}
+        self.numbers = {name: number for number, name in enumerate(dict.fromkeys(names))}
 
     def __call__(self, name: str) -> int:
+        """The number of a name."""
         return self.numbers.setdefault(name, len(self.numbers))
 
 
@@ -80,7 +81,7 @@ def report_data(
     Args:
         studies: one result set, or two of the same frames; the worst frames are those of the last.
         dataset: where images, scans and cameras come from.
-        worst: frames with pictures, of those that have any errors and any images or scan.
+        worst: frames with pictures, the worst of those that have images or a scan.
         limit_bytes: size of the whole report.
     """
     names = Names([part.class_name for study in studies for part in study.classes])
@@ -97,8 +98,7 @@ def report_data(
         if sentences <= 0:
             break
     room -= _size(frames)
-    wanting = [frame for frame in frames if sum(frame["runs"][-1][key] for key in ("wrong", "missed"))]
-    pictures = _pictures(wanting, source, worst, room)
+    pictures = _pictures(frames, source, worst, room)
     return {
         "heading": main.heading,
         "classes": list(names.numbers),
