@@ -80,7 +80,7 @@ class Calibrated:
 
     def frame(self, frame_id: str) -> Frame:
         image = {"left": np.full((40, 120, 3), 90, np.uint8)} if frame_id in ("3", "5") else {}
-        points = np.zeros((50, 4), np.float32) + [10, 1, -1, 0] if frame_id == "5" else None
+        points = [*np.zeros((50, 4), np.float32), 10, 1, -1, 0] if frame_id == "5" else None
         view = Camera("left", np.eye(3, 4), TRANSFORM, 120, 40)
         return Frame(frame_id, points, cameras=[view], images=image)
 
@@ -117,7 +117,7 @@ def test_report_shows_the_numbers_of_the_metrics() -> None:
 def test_rows_that_go_on_name_their_class_and_sums_stand_below() -> None:
     table = TableData("t", ("class", "m"), [("Car", "2D"), ("", "3D"), None, ("mean", "1")])
     html = html_report("t", [result_set().study()], [[table]])
-    assert [["Car", "2D"], ["Car", "3D"], ["mean", "1"]] == [row for row in rows_of(html) if len(row) == 2][1:4]
+    assert [row for row in rows_of(html) if len(row) == 2][1:4] == [["Car", "2D"], ["Car", "3D"], ["mean", "1"]]
     assert re.search(r"<tfoot>\s*<tr><th scope=\"row\">mean", html)
 
 

@@ -17,6 +17,8 @@ VERBS: dict[str, str] = {
     "run": "run",
     "live": "live",
     "ros2": "ros2",
+    "merge": "merge",
+    "export": "export",
     "view": "view",
     "eval": "eval",
     "config": "config",

@@ -57,6 +57,7 @@ def eval(
     from lcf3d.datasets.base import require_missing
     from lcf3d.datasets.opening import open_dataset
     from lcf3d.evaluation.protocol import EvaluationOptions, open_evaluation
+    from lcf3d.run.conversion import as_files
 
     started = monotonic()
     _check(results, compare, out)
@@ -73,7 +74,10 @@ def eval(
     data = open_dataset(dataset, split=split, version=tables)
     evaluation = open_evaluation(data, frames or (data.ids if whole else None), options)
     names = result_names(results)
-    sets = [evaluation.read(path.expanduser(), name, missing) for path, name in zip(results, names, strict=True)]
+    sets = [
+        evaluation.read(as_files(path.expanduser(), data), name, missing)
+        for path, name in zip(results, names, strict=True)
+    ]
     rows = evaluation.compare(sets[0], sets[1], samples, seed) if compare else []
     studies = [one.study() for one in sets] if json_ or out is not None else []
     content: dict[str, Any] = {"results": [study.to_json() for study in studies]}

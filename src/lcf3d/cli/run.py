@@ -55,6 +55,10 @@ def run(
         bool, typer.Option("--smooth", help="as --memory, and later frames testify as well; not for live use")
     ] = False,
     jobs: Annotated[int, typer.Option(min=1, help="processes")] = 1,
+    shard: Annotated[str | None, typer.Option(help="only part i/n of the frames, see 'lcf3d merge'")] = None,
+    format_: Annotated[
+        str, typer.Option("--format", help="of --out: folder (files of each frame) or parquet")
+    ] = "folder",
     pictures: Annotated[bool, typer.Option("--pictures", help="also draw every frame")] = False,
     resume: Annotated[bool, typer.Option("--resume", help="continue a run that was interrupted")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="replace the run that --out holds")] = False,
@@ -92,6 +96,8 @@ def run(
         self_calibrate=self_calibrate,
         memory=memory,
         smooth=smooth,
+        shard=shard,
+        form=format_,
     )
     prepared = prepare_run(request, out, resume=resume, overwrite=overwrite)
     sequences = _sequences(prepared) if memory or smooth else None
