@@ -201,7 +201,7 @@ def test_what_does_not_fit_is_left_out_and_counted() -> None:
 
 def test_reliability_by_hand() -> None:
     rows = reliability(np.array([0.05, 0.15, 0.17, 1.0]), np.array([0, 1, 0, 1]))
-    assert [(row.score, row.right, row.count) for row in rows] == [
+    assert [(row.score, row.right, row.detections) for row in rows] == [
         (0.05, 0.0, 1),
         (pytest.approx(0.16), 0.5, 2),
         (1.0, 1.0, 1),

@@ -18,12 +18,12 @@ class ReliabilityBin(NamedTuple):
     Attributes:
         score: their mean score.
         right: the share of them that is right, 0 to 1.
-        count: how many they are.
+        detections: how many they are.
     """
 
     score: float
     right: float
-    count: int
+    detections: int
 
 
 def reliability(scores: FloatArray, right: FloatArray | BoolArray, bins: int = BINS) -> tuple[ReliabilityBin, ...]:
@@ -49,5 +49,5 @@ def reliability(scores: FloatArray, right: FloatArray | BoolArray, bins: int = B
 
 def calibration_error(rows: tuple[ReliabilityBin, ...]) -> float:
     """Expected calibration error: mean distance between score and share of right ones, by detections; NaN for none."""
-    count = sum(row.count for row in rows)
-    return sum(row.count * abs(row.score - row.right) for row in rows) / count if count else float("nan")
+    count = sum(row.detections for row in rows)
+    return sum(row.detections * abs(row.score - row.right) for row in rows) / count if count else float("nan")

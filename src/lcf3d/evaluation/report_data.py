@@ -128,11 +128,11 @@ def _class_json(part: ClassStudy) -> dict[str, Any]:
         "fusion": values.get("fusion"),
         "ap": [list(part.ap_over_threshold), _numbers(list(part.ap_over_threshold.values()), 2)],
         "distance": [
-            [row["near_m"], row["far_m"], None if np.isnan(row["AP"]) else round(row["AP"], 2), row["objects"]]
+            [row["near_m"], row["far_m"], None if row["AP"] is None else round(row["AP"], 2), row["objects"]]
             for row in values["ap_by_distance"]
         ],
         "curve": [_numbers(column[kept], 4) for column in (part.recall, part.precision, part.scores)],
-        "reliability": [[round(row.score, 4), round(row.right, 4), row.count] for row in part.reliability],
+        "reliability": [[round(row.score, 4), round(row.right, 4), row.detections] for row in part.reliability],
         "calibration_error": round(calibration_error(part.reliability), 4) if part.reliability else None,
     }
 

@@ -91,7 +91,7 @@ class ClassStudy:
     reliability: tuple[ReliabilityBin, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
-        """Plain JSON values, without infinities."""
+        """Plain JSON values, None for what is infinite or not a number."""
         values: dict[str, Any] = {
             "measure": self.measure,
             "threshold": self.threshold_name,
@@ -100,7 +100,7 @@ class ClassStudy:
                 {
                     "near_m": row.near,
                     "far_m": row.far if np.isfinite(row.far) else None,
-                    "AP": row.ap,
+                    "AP": row.ap if np.isfinite(row.ap) else None,
                     "objects": row.objects,
                 }
                 for row in self.distance

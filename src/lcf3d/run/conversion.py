@@ -37,8 +37,8 @@ def convert_run(source: Path, dataset: Dataset, out: Path, form: str) -> int:
     done = set(run.frame_ids())
     frame_ids = [frame_id for frame_id in dataset.ids if frame_id in done]
     if len(frame_ids) < len(done):
-        first = min(done - set(frame_ids))
-        raise ConfigError(f"{len(done) - len(frame_ids)} frames of {source} are not in its dataset, first {first}")
+        foreign = sorted(done - set(frame_ids))
+        raise ConfigError(f"{len(foreign)} frames of {source} are not in its dataset, first {foreign[0]}")
     for first in range(0, len(frame_ids), SHARD_FRAMES):
         with target.shard():
             for frame_id in frame_ids[first : first + SHARD_FRAMES]:

@@ -119,7 +119,7 @@ def _write_space(run: RunFolder, dataset: Dataset, frame_ids: Sequence[str], for
     """A submission of nuScenes or Argoverse 2."""
     found = {frame_id: run.read(frame_id).detections for frame_id in frame_ids}
     if form == "argoverse":
-        from lcf3d.datasets.argoverse2_results import results_of_frames
+        from lcf3d.datasets.argoverse2_frames import results_of_frames
         from lcf3d.formats.argoverse import write_submission
 
         results = results_of_frames(found)
