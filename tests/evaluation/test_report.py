@@ -80,7 +80,7 @@ class Calibrated:
 
     def frame(self, frame_id: str) -> Frame:
         image = {"left": np.full((40, 120, 3), 90, np.uint8)} if frame_id in ("3", "5") else {}
-        points = [*np.zeros((50, 4), np.float32), 10, 1, -1, 0] if frame_id == "5" else None
+        points = np.tile(np.array([10, 1, -1, 0], np.float32), (50, 1)) if frame_id == "5" else None
         view = Camera("left", np.eye(3, 4), TRANSFORM, 120, 40)
         return Frame(frame_id, points, cameras=[view], images=image)
 

@@ -93,9 +93,14 @@ def test_shards_of_tables_are_whole_or_not_there(root: Path, tmp_path: Path) -> 
     tables = fused(root, tmp_path / "tables", form="parquet")
     folder = TableRunFolder(tmp_path / "broken")
     frame, one = open_dataset(f"toy:{root / 'data'}").frame("f00"), lcf3d.read_run(tables)["f00"]
-    with pytest.raises(RuntimeError), folder.shard():
-        folder.write(frame, one)
-        raise RuntimeError
+
+    def interrupted() -> None:
+        with folder.shard():
+            folder.write(frame, one)
+            raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        interrupted()
     assert folder.frame_ids() == []
     for _ in range(2):
         with folder.shard():

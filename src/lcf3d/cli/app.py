@@ -21,6 +21,7 @@ VERBS: dict[str, str] = {
     "export": "export",
     "view": "view",
     "eval": "eval",
+    "serve": "serve",
     "config": "config",
     "check": "check",
     "bench": "bench",

@@ -84,7 +84,7 @@ def eval(
     if compare:
         content["comparison"] = {"samples": samples, "seed": seed, "rows": [_row_json(row) for row in rows]}
     if out is not None:
-        origin = _origin(data, dataset, results, options, monotonic() - started)
+        origin = report_origin(data, dataset, results, options, monotonic() - started)
         _write(data, sets, studies, rows, content, out, worst, origin)
     if json_:
         typer.echo(json.dumps(content, indent=2))
@@ -184,8 +184,8 @@ def _write(
         write_json(out / "metrics_details.json", details(), indent=None)
 
 
-def _origin(
-    data: Dataset, dataset: str, results: Sequence[Path], options: EvaluationOptions, seconds: float
+def report_origin(
+    data: Dataset, dataset: str, results: Sequence[Path], options: EvaluationOptions, seconds: float | None = None
 ) -> dict[str, str]:
     """What made the report, for its foot."""
     import os
@@ -204,7 +204,8 @@ def _origin(
         "Dataset": dataset,
         "Protocol": data.evaluation.partition(":")[2] + (f", {asked}" if asked else ""),
         "Machine": f"{platform.system()} {platform.release()}, {platform.machine()}, {os.cpu_count()} processors",
-        "Made": f"{datetime.now(timezone.utc):%Y-%m-%d %H:%M} UTC, measured in {seconds:.1f} s",
+        "Made": f"{datetime.now(timezone.utc):%Y-%m-%d %H:%M} UTC"
+        + ("" if seconds is None else f", measured in {seconds:.1f} s"),
     }
     for path in results:
         for name, title in (("run.json", "Run"), ("config.yaml", "Settings")):

@@ -55,6 +55,20 @@ def html_report(
         origin: what made the report, for its foot: version, command and so on, by name.
         limit_bytes: the largest size; pictures are left out first.
     """
+    data = report_data(studies, dataset, worst, limit_bytes)
+    return render(title, studies, tables, comparison, data, origin or {}, limit_bytes)
+
+
+def render(
+    title: str,
+    studies: Sequence[Study],
+    tables: Sequence[Sequence[TableData]],
+    comparison: Sequence[ComparisonRow],
+    data: Mapping[str, Any],
+    origin: Mapping[str, str],
+    limit_bytes: int | None = None,
+) -> str:
+    """The page around what `report_data` gives; for the others see `html_report`."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     environment = Environment(
@@ -70,7 +84,6 @@ def html_report(
         Section("At the best F1", [_outcome_table(study, studies) for study in studies]),
         *_fusion_section(studies),
     ]
-    data = report_data(studies, dataset, worst, limit_bytes)
     return environment.get_template("report.html").render(
         title=title,
         introduction=_introduction(studies),
@@ -81,12 +94,11 @@ def html_report(
         comparison=comparison,
         reach=_reach(comparison),
         data=_script_json(data),
-        has_reliability=any(part.reliability for study in studies for part in study.classes),
         left_out=data["left_out"],
         shown=len(data["frames"]),
         pictured=len(data["pictures"]),
-        limit=f"{limit_bytes / 1e6:g} MB",
-        origin=origin or {},
+        limit="" if limit_bytes is None else f"{limit_bytes / 1e6:g} MB",
+        origin=origin,
         assets={name: asset(name) for name in ("report.css", "report.js", "scene.js", "uplot.css", "uplot.js")},
     )
 

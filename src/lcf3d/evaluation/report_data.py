@@ -242,28 +242,34 @@ def _pictures(frames: Sequence[dict[str, Any]], source: FrameSource, count: int,
     for shown in frames:
         if len(pictures) == count:
             break
-        frame = source(shown["id"])
-        cameras = [c for c in frame.cameras if c.name in frame.images and c.name in source.camera_names]
-        picture: dict[str, Any] = {
-            "images": [
-                {
-                    "camera": camera.name,
-                    "size": [camera.width, camera.height],
-                    "src": embedded_image(frame.images[camera.name]),
-                    "boxes": [_in_image(run["boxes"], camera, camera is frame.cameras[0]) for run in shown["runs"]],
-                }
-                for camera in cameras
-            ]
-        }
-        scan = _scan(frame)
-        if scan is not None:
-            picture["scan"] = scan
+        picture = frame_picture(shown, source)
         room -= _size(picture)
         if room < 0:
             break
-        if picture["images"] or scan is not None:
+        if picture["images"] or "scan" in picture:
             pictures[shown["id"]] = picture
     return pictures
+
+
+def frame_picture(shown: Mapping[str, Any], source: FrameSource) -> dict[str, Any]:
+    """Images of one frame with the boxes in them, and its scan; ``shown`` is the frame as `report_data` has it."""
+    frame = source(shown["id"])
+    cameras = [c for c in frame.cameras if c.name in frame.images and c.name in source.camera_names]
+    picture: dict[str, Any] = {
+        "images": [
+            {
+                "camera": camera.name,
+                "size": [camera.width, camera.height],
+                "src": embedded_image(frame.images[camera.name]),
+                "boxes": [_in_image(run["boxes"], camera, camera is frame.cameras[0]) for run in shown["runs"]],
+            }
+            for camera in cameras
+        ]
+    }
+    scan = _scan(frame)
+    if scan is not None:
+        picture["scan"] = scan
+    return picture
 
 
 def _scan(frame: Frame) -> str | None:
