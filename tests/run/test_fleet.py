@@ -234,3 +234,39 @@ def test_exports_that_do_not_fit_are_refused(root: Path, tmp_path: Path) -> None
         export_run(run, data, "coco", tmp_path)
     with pytest.raises(ConfigError, match="--format takes folder or parquet"):
         fused(root, tmp_path / "other", form="csv")
+
+
+def test_verbs(root: Path, tmp_path: Path) -> None:
+    from typer.testing import CliRunner
+
+    from lcf3d.cli.app import app
+
+    def call(*arguments: object) -> str:
+        result = CliRunner().invoke(app, [str(a) for a in arguments], catch_exceptions=False)
+        assert result.exit_code == 0, result.output
+        return result.output
+
+    toy = f"toy:{root / 'data'}"
+    branches = ("--lidar", f"results:{root / 'lidar'}", "--camera", f"results:{root / 'camera'}")
+    for i in (1, 2):
+        call("run", toy, *branches, "--format", "parquet", "--shard", f"{i}/2", "--out", tmp_path / f"s{i}")
+    assert "12 frames of 2 shards" in call("merge", tmp_path / "s1", tmp_path / "s2", "--out", tmp_path / "all")
+    assert call("view", tmp_path / "all", "--limit", 1).strip().endswith("f00.png")
+    call("export", tmp_path / "all", "--to", "folder", "--out", tmp_path / "files")
+    first, second = (json.loads(call("eval", toy, tmp_path / name, "--json")) for name in ("all", "files"))
+    assert first["results"][0]["metrics"] == second["results"][0]["metrics"]
+    call("eval", toy, tmp_path / "all", "--out", tmp_path / "report")
+    assert "Settings of all" in (tmp_path / "report" / "report.html").read_text()
+
+
+def test_a_dataset_that_moved_is_named(root: Path, tmp_path: Path) -> None:
+    from lcf3d.cli.export import dataset_of_run
+
+    run = fused(root, tmp_path / "run")
+    path = run / "run.json"
+    path.write_text(path.read_text().replace(str(root / "data"), str(tmp_path / "gone")))
+    with pytest.raises(ConfigError, match="name it with --dataset"):
+        dataset_of_run(run, None)
+    assert dataset_of_run(run, f"toy:{root / 'data'}")[1].startswith("toy:")
+    with pytest.raises(ConfigError, match="no folder of 'lcf3d run'"):
+        dataset_of_run(tmp_path, None)
