@@ -2,6 +2,7 @@
 
 import json
 import multiprocessing
+from dataclasses import replace
 from importlib.metadata import EntryPoint
 from pathlib import Path
 
@@ -12,7 +13,8 @@ import lcf3d
 from lcf3d import plugins
 from lcf3d.datasets.opening import open_dataset
 from lcf3d.errors import ConfigError, FormatError
-from lcf3d.formats.fused_table import read_frames
+from lcf3d.formats.fused_table import read_frames, write_frames
+from lcf3d.provenance import TrackTable
 from lcf3d.run.conversion import convert_run
 from lcf3d.run.export import export_run
 from lcf3d.run.shards import frames_of_shard, merge_shards, parse_shard
@@ -55,6 +57,25 @@ def test_tables_hold_what_the_files_hold(root: Path, tmp_path: Path) -> None:
     for frame_id, one in first.items():
         assert one.to_json() == second[frame_id].to_json()
         assert [one.explain(i) for i in range(len(one))] == [second[frame_id].explain(i) for i in range(len(one))]
+
+
+def test_tracks_are_kept(root: Path, tmp_path: Path) -> None:
+    tables = fused(root, tmp_path / "tables", form="parquet")
+    one = lcf3d.read_run(tables)["f00"]
+    n = len(one)
+    times = np.linspace(0.0, 0.5, n)
+    tracks = TrackTable(np.arange(n) + 7, times, np.full(n, 2), np.zeros(n), times * 2, times - 1)
+    path = tmp_path / "part-1.parquet"
+    write_frames(path, [("f00", replace(one, tracks=tracks))])
+    ((_, back),) = read_frames(path)
+    assert back.tracks is not None
+    assert back.explain(1) == replace(one, tracks=tracks).explain(1)
+    assert back.tracks.ids.tolist() == tracks.ids.tolist()
+
+
+def test_shards_and_memory_do_not_go_together(root: Path, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="takes drives apart"):
+        fused(root, tmp_path / "out", shard="1/2", memory=True)
 
 
 def test_runs_are_converted_both_ways(root: Path, tmp_path: Path) -> None:

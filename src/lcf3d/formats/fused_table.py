@@ -14,7 +14,7 @@ import numpy as np
 
 from lcf3d.errors import ConfigError, FormatError
 from lcf3d.files import atomic_path
-from lcf3d.provenance import Decisions, FusedDetections, Outcome, Reason
+from lcf3d.provenance import Decisions, FusedDetections, Outcome, Reason, TrackTable
 from lcf3d.structures import Detections2D, Detections3D
 
 SCHEMA = "1"
@@ -53,6 +53,10 @@ def frame_schema() -> Any:
         *((name, pa.list_(pa.int64())) for name in _WHOLE),
         *((name, pa.list_(pa.float64())) for name in _REAL),
     ]
+    tracks = [
+        (column.name, pa.list_(pa.int64() if column.name in ("ids", "hits") else pa.float64()))
+        for column in fields(TrackTable)
+    ]
     return pa.schema(
         [
             ("frame", pa.string()),
@@ -63,6 +67,7 @@ def frame_schema() -> Any:
             ("camera_inputs", pa.list_(pa.struct(boxes))),
             ("lidar", pa.struct(decisions)),
             ("camera", pa.struct(decisions)),
+            ("tracks", pa.struct(tracks)),
         ],
         metadata={_KEY: SCHEMA.encode()},
     )
@@ -82,6 +87,7 @@ def detection_schema() -> Any:
             ("outcome", pa.string()),
             ("reason", pa.string()),
             ("explanation", pa.string()),
+            ("track", pa.int64()),
         ],
         metadata={_KEY: SCHEMA.encode()},
     )
@@ -155,6 +161,9 @@ def _frame_row(frame_id: str, fused: FusedDetections) -> dict[str, Any]:
         "camera_inputs": [_boxes(found) for found in fused.camera_inputs],
         "lidar": _columns(fused.lidar),
         "camera": _columns(fused.camera),
+        "tracks": None
+        if fused.tracks is None
+        else {column.name: getattr(fused.tracks, column.name).tolist() for column in fields(TrackTable)},
     }
 
 
@@ -194,12 +203,14 @@ def _from_row(row: dict[str, Any]) -> FusedDetections:
         names = [column.name for column in fields(Decisions)]
         columns = [row[name][column] for column in names]
         value[name] = [dict(zip(names, cells, strict=True)) for cells in zip(*columns, strict=True)]
+    if row["tracks"] is not None:
+        value["tracks"] = row["tracks"]
     return FusedDetections.from_json(value)
 
 
 def _detection_rows(frame_id: str, fused: FusedDetections) -> Iterator[dict[str, Any]]:
     found = fused.detections
-    reasons = np.zeros(len(found), dtype=np.int64)
+    reasons = np.full(len(found), -1)
     for table in (fused.camera, fused.lidar):
         led = table.output >= 0
         reasons[table.output[led]] = table.reason[led]
@@ -219,6 +230,8 @@ def _detection_rows(frame_id: str, fused: FusedDetections) -> Iterator[dict[str,
             "velocity_y": velocity[1],
             "attribute": None if found.attributes is None else str(found.attributes[i]) or None,
             "outcome": Outcome(outcomes[i]).name.lower(),
-            "reason": Reason(reasons[i]).name.lower(),
+            # boxes that only the memory of past frames predicts have none
+            "reason": None if reasons[i] < 0 else Reason(reasons[i]).name.lower(),
             "explanation": fused.explain(i),
+            "track": None if fused.tracks is None else int(fused.tracks.ids[i]),
         }

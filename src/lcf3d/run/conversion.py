@@ -44,7 +44,7 @@ def convert_run(source: Path, dataset: Dataset, out: Path, form: str) -> int:
             for frame_id in frame_ids[first : first + SHARD_FRAMES]:
                 target.write(dataset.frame(frame_id), run.read(frame_id))
     target.finish(frame_ids)
-    for name in ("config.yaml", "calibration.json"):
+    for name in ("config.yaml", "calibration.json", "alignment.json"):
         if (source / name).is_file():
             (out / name).write_bytes((source / name).read_bytes())
     write_json(out / "run.json", {**request, "form": form})

@@ -140,7 +140,9 @@ def prepare_run(
     dataset, frame_ids, config, lidar, cameras, localizer = read_inputs(request, settings=settings)
     own_ids = frames_of_shard(frame_ids, request.shard)
     if request.shard is not None and (request.memory or request.smooth):
-        raise ConfigError("--shard takes drives apart, and --memory and --smooth need them whole; leave one of them out")
+        raise ConfigError(
+            "--shard takes drives apart, and --memory and --smooth need them whole; leave one out"
+        )
     folder = TableRunFolder(out) if request.form == "parquet" else RunFolder(out, dataset.writer(out))
     memory = MemoryConfig() if request.memory or request.smooth else None
     fusion = make_fusion(config, localizer)

@@ -71,7 +71,7 @@ def merge_shards(shards: Sequence[Path], out: Path) -> int:
         for name in _FOLDERS:
             if (folder / name).is_dir():
                 shutil.copytree(folder / name, out / name, dirs_exist_ok=True)
-    for name in ("config.yaml", "calibration.json"):
+    for name in ("config.yaml", "calibration.json", "alignment.json"):
         if (shards[0] / name).is_file():
             shutil.copy2(shards[0] / name, out / name)
     if request.get("form", "folder") == "folder":
