@@ -87,7 +87,7 @@ function lineChart(title, xLabel, yLabel, xRange, yRange, lines, describe) {
     scales: { x: { time: false, range: xRange }, y: { range: yRange } },
     axes: [axis(xLabel), axis(yLabel)],
     cursor: { drag: { x: false, y: false }, points: { size: 8 } },
-    legend: { live: false },
+    legend: { live: false, markers: { width: 2, stroke: (_, i) => lines[i - 1]?.colour, dash: (_, i) => lines[i - 1]?.dash ? "dashed" : "solid" } },
     series: [{ label: xLabel }, ...lines.map(line => ({ label: line.label, stroke: line.colour, width: 2, dash: line.dash, spanGaps: true, points: { show: line.x.length < 30, size: 6 } }))],
   }, joined, plot);
   new ResizeObserver(() => { if (plot.clientWidth > 50) chart.setSize({ width: plot.clientWidth, height: 270 }); }).observe(plot);
@@ -291,7 +291,7 @@ function chosenFrames() {
 // ---- frames
 
 const COLUMNS = [["id", "frame"], ["errors", "errors"], ["wrong", "wrong"], ["missed", "missed"], ["boxes", "boxes"],
-  ...(DATA.runs.length > 1 ? [["gain", "more than other"]] : [])];
+  ...(DATA.runs.length > 1 ? [["gain", "± other"]] : [])];
 
 function buildHead() {
   const cells = COLUMNS.map(([key, text]) => {

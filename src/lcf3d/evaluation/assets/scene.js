@@ -87,7 +87,7 @@ class ViewInSpace {
   constructor(scan, boxes) {
     this.points = decodeScan(scan);
     this.boxes = boxes.filter(box => box && box.b);
-    this.turn = Math.PI;
+    this.turn = 0;
     this.tilt = .45;
     this.distance = 38;
     this.canvas = document.createElement("canvas");
@@ -115,7 +115,7 @@ class ViewInSpace {
   }
 
   rotate(turn, tilt) {
-    this.turn -= turn;
+    this.turn += turn;
     this.tilt = Math.min(1.5, Math.max(.03, this.tilt + tilt));
     this.draw();
   }
@@ -138,7 +138,8 @@ class ViewInSpace {
     // the eye circles a place 14 m ahead of the LiDAR
     const project = (x, y, z) => {
       const dx = x - 14, dz = z + 1;
-      const u = dx * ct + y * st, v = -dx * st + y * ct;
+      // along the view, and to its right
+      const u = dx * ct + y * st, v = dx * st - y * ct;
       const depth = this.distance + u * cp - dz * sp, up = u * sp + dz * cp;
       return depth < .5 ? null : [width / 2 + focal * v / depth, height / 2 - focal * up / depth, depth];
     };
