@@ -96,11 +96,12 @@ def evaluate(
     from lcf3d.datasets.base import require_missing
     from lcf3d.datasets.opening import open_dataset
     from lcf3d.evaluation.protocol import EvaluationOptions, open_evaluation
+    from lcf3d.run.conversion import as_files
 
     data = open_dataset(dataset, split=split) if isinstance(dataset, str | Path) else dataset
     path = Path(results).expanduser()
     evaluation = open_evaluation(data, frames, EvaluationOptions(**options))
-    return evaluation.read(path, path.name, require_missing(missing))
+    return evaluation.read(as_files(path, data), path.name, require_missing(missing))
 
 
 def draw(
@@ -137,9 +138,9 @@ def read_run(folder: str | Path) -> dict[str, FusedDetections]:
         FormatError: a file is missing or not readable.
         ConfigError: it is no run folder, or one of a later version.
     """
-    from lcf3d.run.folder import RunFolder
+    from lcf3d.run.table_folder import open_run_folder
 
-    run_folder = RunFolder(Path(folder).expanduser())
+    run_folder = open_run_folder(Path(folder).expanduser())
     if not run_folder.is_run(run_folder.path):
         raise ConfigError(f"{folder} is no folder of 'lcf3d run': it has no run.json and provenance")
     run_folder.request()

@@ -12,7 +12,7 @@ from lcf3d.errors import ConfigError
 
 if TYPE_CHECKING:
     from lcf3d.datasets.base import Dataset
-    from lcf3d.evaluation.protocol import ComparisonRow, ResultSet, TableData
+    from lcf3d.evaluation.protocol import ComparisonRow, EvaluationOptions, ResultSet, TableData
     from lcf3d.evaluation.study import Study
 
 
@@ -51,12 +51,15 @@ def eval(
     Example: lcf3d eval kitti:KITTI_TRACKING fused --tracking
     """
     import json
+    from time import monotonic
 
     from lcf3d.cli.console import console, print_table
     from lcf3d.datasets.base import require_missing
     from lcf3d.datasets.opening import open_dataset
     from lcf3d.evaluation.protocol import EvaluationOptions, open_evaluation
+    from lcf3d.run.conversion import as_files
 
+    started = monotonic()
     _check(results, compare, out)
     if tracking:
         from lcf3d.cli.eval_tracking import eval_tracking
@@ -71,14 +74,18 @@ def eval(
     data = open_dataset(dataset, split=split, version=tables)
     evaluation = open_evaluation(data, frames or (data.ids if whole else None), options)
     names = result_names(results)
-    sets = [evaluation.read(path.expanduser(), name, missing) for path, name in zip(results, names, strict=True)]
+    sets = [
+        evaluation.read(as_files(path.expanduser(), data), name, missing)
+        for path, name in zip(results, names, strict=True)
+    ]
     rows = evaluation.compare(sets[0], sets[1], samples, seed) if compare else []
     studies = [one.study() for one in sets] if json_ or out is not None else []
     content: dict[str, Any] = {"results": [study.to_json() for study in studies]}
     if compare:
         content["comparison"] = {"samples": samples, "seed": seed, "rows": [_row_json(row) for row in rows]}
     if out is not None:
-        _write(data, sets, studies, rows, content, out, worst)
+        origin = report_origin(data, dataset, results, options, monotonic() - started)
+        _write(data, sets, studies, rows, content, out, worst, origin)
     if json_:
         typer.echo(json.dumps(content, indent=2))
         return
@@ -161,17 +168,48 @@ def _write(
     content: dict[str, Any],
     out: Path,
     worst: int,
+    origin: dict[str, str],
 ) -> None:
     """The report and its numbers."""
-    from lcf3d.evaluation.pictures import worst_frame_pictures
     from lcf3d.evaluation.report import html_report
     from lcf3d.files import write_json, write_text
 
-    pictures = worst_frame_pictures(studies[-1], data, worst)
     write_json(out / "metrics.json", content)
     title = f"{studies[0].heading}: {' and '.join(study.name for study in studies)}"
-    write_text(out / "report.html", html_report(title, studies, [one.tables() for one in sets], rows, pictures))
+    tables = [one.tables() for one in sets]
+    write_text(out / "report.html", html_report(title, studies, tables, rows, data, worst, origin))
     details = getattr(sets[-1], "details_json", None)
     if details is not None:
         write_json(out / "metrics_summary.json", sets[-1].to_json())
         write_json(out / "metrics_details.json", details(), indent=None)
+
+
+def report_origin(
+    data: Dataset, dataset: str, results: Sequence[Path], options: EvaluationOptions, seconds: float | None = None
+) -> dict[str, str]:
+    """What made the report, for its foot."""
+    import os
+    import platform
+    import shlex
+    import sys
+    from dataclasses import asdict
+    from datetime import datetime, timezone
+
+    from lcf3d import __version__
+
+    asked = ", ".join(f"{name} {value}" for name, value in asdict(options).items() if value)
+    rows = {
+        "Version": f"lcf3d {__version__}, Python {platform.python_version()}",
+        "Command": shlex.join(["lcf3d", *sys.argv[1:]]),
+        "Dataset": dataset,
+        "Protocol": data.evaluation.partition(":")[2] + (f", {asked}" if asked else ""),
+        "Machine": f"{platform.system()} {platform.release()}, {platform.machine()}, {os.cpu_count()} processors",
+        "Made": f"{datetime.now(timezone.utc):%Y-%m-%d %H:%M} UTC"
+        + ("" if seconds is None else f", measured in {seconds:.1f} s"),
+    }
+    for path in results:
+        for name, title in (("run.json", "Run"), ("config.yaml", "Settings")):
+            file = run_folder(path) / name
+            if file.is_file():
+                rows[f"{title} of {run_folder(path).name}"] = file.read_text(encoding="utf-8")
+    return rows

@@ -59,9 +59,14 @@ def run(
         bool, typer.Option("--smooth", help="as --memory, and later frames testify as well; not for live use")
     ] = False,
     jobs: Annotated[int, typer.Option(min=1, help="processes")] = 1,
+    shard: Annotated[str | None, typer.Option(help="only part i/n of the frames, see 'lcf3d merge'")] = None,
     format_: Annotated[
-        str | None, typer.Option("--format", help="also write a bag of sensors and fused boxes: mcap, rosbag2, rosbag1")
-    ] = None,
+        str,
+        typer.Option(
+            "--format",
+            help="of --out: folder (files of each frame) or parquet; mcap, rosbag2, rosbag1: a folder and a bag",
+        ),
+    ] = "folder",
     pictures: Annotated[bool, typer.Option("--pictures", help="also draw every frame")] = False,
     resume: Annotated[bool, typer.Option("--resume", help="continue a run that was interrupted")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="replace the run that --out holds")] = False,
@@ -99,9 +104,11 @@ def run(
         self_calibrate=self_calibrate,
         memory=memory,
         smooth=smooth,
+        shard=shard,
+        form="parquet" if format_ == "parquet" else "folder",
     )
-    if format_ not in (None, *_BAGS):
-        raise ConfigError(f"--format takes {', '.join(_BAGS)}, got {format_!r}")
+    if format_ not in ("folder", "parquet", *_BAGS):
+        raise ConfigError(f"--format takes folder, parquet, {', '.join(_BAGS)}, got {format_!r}")
     prepared = prepare_run(request, out, resume=resume, overwrite=overwrite)
     sequences = _sequences(prepared) if memory or smooth else None
     pending = (
@@ -111,7 +118,7 @@ def run(
     )
     summaries = _fuse(prepared, pending, jobs, sequences, quiet=json_)
     prepared.folder.finish(prepared.frame_ids)
-    if format_ is not None:
+    if format_ in _BAGS:
         _write_bag(prepared, out / _BAGS[format_])
     if pictures:
         _draw(prepared, quiet=json_)

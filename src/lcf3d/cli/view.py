@@ -121,6 +121,7 @@ def _frame_ids(dataset: Dataset, chosen: Sequence[str], shown: Path | None, limi
     """The frames to draw: those chosen, else those of the run."""
     from lcf3d.datasets.base import require_frames
     from lcf3d.run.folder import RunFolder
+    from lcf3d.run.table_folder import open_run_folder
 
     if not chosen:
         if shown is None or not RunFolder.is_run(shown):
@@ -128,7 +129,7 @@ def _frame_ids(dataset: Dataset, chosen: Sequence[str], shown: Path | None, limi
                 f"name the frames to draw with --frame, for example --frame {dataset.ids[0]}; "
                 "without it, view draws the frames of a run folder"
             )
-        chosen = RunFolder(shown).frame_ids()
+        chosen = open_run_folder(shown).frame_ids()
         if not chosen:
             raise ConfigError(f"{shown} holds no finished frames yet")
     return list(require_frames(dataset, chosen, "the dataset"))[:limit]
@@ -139,6 +140,7 @@ def _scenes(
 ) -> Callable[[Frame], Scene]:
     """What to draw over a frame."""
     from lcf3d.run.folder import RunFolder
+    from lcf3d.run.table_folder import open_run_folder
     from lcf3d.structures import Detections3D
     from lcf3d.visualization.scene import Scene
 
@@ -147,7 +149,7 @@ def _scenes(
     if shown is None:
         return lambda frame: Scene.from_detections(Detections3D.empty(()), truth=frame.labels if truth else None)
     if RunFolder.is_run(shown):
-        folder = RunFolder(shown)
+        folder = open_run_folder(shown)
         return lambda frame: Scene.from_fused(folder.read(frame.id), frame.labels if truth else None, min_score)
     boxes, flat = _result_readers(dataset, shown, first)
 

@@ -97,6 +97,10 @@ class ImageFiles(Mapping[str, NDArray[np.uint8]]):
     def __getitem__(self, name: str) -> NDArray[np.uint8]:
         return read_image(self._paths[name])
 
+    def path(self, name: str) -> Path | None:
+        """The file of a camera's image; None where there is none."""
+        return self._paths.get(name)
+
     def __iter__(self) -> Iterator[str]:
         return iter(self._paths)
 

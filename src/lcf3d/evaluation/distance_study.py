@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from lcf3d.evaluation.center_distance import EvaluationBoxes, class_curves, matched_objects
+from lcf3d.evaluation.reliability import reliability
 from lcf3d.evaluation.study import DISTANCE_RANGES, ClassStudy, DistanceRow, FusionOutcomes, ShownBox, Study
 from lcf3d.geometry.camera import project_boxes
 from lcf3d.provenance import FusedDetections, Outcome, Reason
@@ -114,12 +116,23 @@ def distance_study(
                 threshold,
                 counts,
                 _fusion_outcomes(results, point, frame_ids, provenance, found) if provenance else None,
+                reliability(found.scores[own], matches[own] >= 0),
             )
         )
     wrong = np.bincount(found.frames[above & (matches < 0)], minlength=len(frame_ids))
     lost = np.bincount(truth.frames[missed], minlength=len(frame_ids))
     state = _Drawn(results, above, missed, matches, truth_near)
-    return Study(name, heading, frame_ids, metrics, tuple(classes), wrong, lost, lambda f: state.boxes(f, camera_of(f)))
+    return Study(
+        name,
+        heading,
+        frame_ids,
+        metrics,
+        tuple(classes),
+        wrong,
+        lost,
+        lambda f: state.boxes(f, camera_of(f)),
+        lambda f: provenance.get(frame_ids[f]),
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -235,22 +248,36 @@ class _Drawn:
     matches: IntArray
     near: BoolArray
 
+    @cached_property
+    def truth_starts(self) -> IntArray:
+        """(F + 1,) first row of each frame's labels."""
+        return _starts(self.results.truth)
+
+    @cached_property
+    def found_starts(self) -> IntArray:
+        """(F + 1,) first row of each frame's detections."""
+        return _starts(self.results.found)
+
     def boxes(self, frame: int, camera: Camera | None) -> list[ShownBox]:
         """What there is to draw of a frame."""
         shown = []
         truth, found = self.results.truth[frame], self.results.found[frame]
-        first = sum(len(f) for f in self.results.truth[:frame])
+        first = int(self.truth_starts[frame])
         for i, flat in enumerate(_projected(truth, camera)):
             row = first + i
             outcome = "missed" if self.missed[row] else "found" if self.near[row] else "ignored"
             shown.append(ShownBox(truth.class_names[truth.labels[i]], outcome, None, truth.boxes[i], flat))
-        first = sum(len(f) for f in self.results.found[:frame])
+        first = int(self.found_starts[frame])
         for i, flat in enumerate(_projected(found, camera)):
             if self.above[first + i]:
                 outcome = "right" if self.matches[first + i] >= 0 else "wrong"
                 name, score = found.class_names[found.labels[i]], float(found.scores[i])
                 shown.append(ShownBox(name, outcome, score, found.boxes[i], flat, i))
         return shown
+
+
+def _starts(frames: Sequence[Detections3D]) -> IntArray:
+    return np.concatenate([[0], np.cumsum([len(f) for f in frames])]).astype(np.int64)
 
 
 def _projected(detections: Detections3D, camera: Camera | None) -> list[FloatArray | None]:

@@ -13,10 +13,10 @@ from lcf3d.evaluation.curves import best_f1_score
 from lcf3d.evaluation.kitti import KittiEvaluator, Selection
 from lcf3d.evaluation.kitti_matching import COUNTS, FALSE_POSITIVE, TRUE_POSITIVE
 from lcf3d.evaluation.study import FusionOutcomes
-from lcf3d.files import read_json, reading
 from lcf3d.formats.kitti import KittiFrames, KittiObjects
 from lcf3d.geometry.boxes import kitti_from_lidar
 from lcf3d.provenance import FusedDetections, Outcome, Reason
+from lcf3d.run.table_folder import open_run_folder
 from lcf3d.structures import FloatArray, IntArray
 
 
@@ -58,16 +58,15 @@ def working_point(evaluator: KittiEvaluator, selection: Selection, threshold: fl
 
 
 def read_provenance(results: Path, frame_ids: tuple[str, ...]) -> dict[str, FusedDetections]:
-    """What the fusion wrote in ``results/provenance/FRAME.json``, by frame; empty where there is no such folder.
+    """What the fusion wrote in ``results/provenance``, by frame; empty where there is no such folder.
 
     Raises:
-        FormatError: a file is not JSON.
+        FormatError: a file is not readable.
     """
-    folder = Path(results) / "provenance"
-    if not folder.is_dir():
+    if not (Path(results) / "provenance").is_dir():
         return {}
-    paths = {frame_id: folder / f"{frame_id}.json" for frame_id in frame_ids}
-    return {frame_id: _fused(path) for frame_id, path in paths.items() if path.is_file()}
+    folder = open_run_folder(results)
+    return {frame_id: folder.read(frame_id) for frame_id in frame_ids if folder.is_done(frame_id)}
 
 
 def fusion_outcomes(
@@ -129,12 +128,12 @@ def _origins(evaluator: KittiEvaluator, provenance: Mapping[str, FusedDetections
                 lowered = table.reason[row] == Reason.DOWNWEIGHTED
                 name = "downweighted" if lowered else Outcome(table.outcome[row]).name.lower()
                 names[table.output[row]] = name
-        for row, output in _same_detections(results[f], fused):
+        for row, output in same_detections(results[f], fused):
             origins[results.starts[f] + row] = names[output]
     return origins
 
 
-def _same_detections(objects: KittiObjects, fused: FusedDetections) -> list[tuple[int, int]]:
+def same_detections(objects: KittiObjects, fused: FusedDetections) -> list[tuple[int, int]]:
     """Pairs (result line, fused output): the writer may leave outputs out and rounds scores, but keeps their order."""
     pairs: list[tuple[int, int]] = []
     first = 0
@@ -185,8 +184,3 @@ def _dropped_boxes(
         )
         reasons += [Reason(code).name.lower() for code in fused.lidar.reason[rows]]
     return KittiFrames.from_frames(evaluator.truth.frame_ids, frames), np.array(reasons, dtype=np.str_)
-
-
-def _fused(path: Path) -> FusedDetections:
-    with reading(path, "the provenance of a frame"):
-        return FusedDetections.from_json(read_json(path))

@@ -12,7 +12,8 @@ from lcf3d.evaluation.curves import precision_recall
 from lcf3d.evaluation.kitti import MEASURE_NAMES, KittiEvaluator, Selection
 from lcf3d.evaluation.kitti_breakdown import IOU_THRESHOLDS, ap_by_distance, ap_over_iou
 from lcf3d.evaluation.kitti_matching import BELOW, COUNTS, FALSE_POSITIVE, IGNORED, TRUE_POSITIVE
-from lcf3d.evaluation.kitti_outcomes import WorkingPoint, fusion_outcomes, working_point
+from lcf3d.evaluation.kitti_outcomes import WorkingPoint, fusion_outcomes, same_detections, working_point
+from lcf3d.evaluation.reliability import ReliabilityBin, reliability
 from lcf3d.evaluation.study import ClassStudy, ShownBox, Study
 from lcf3d.formats.kitti import KittiObjects
 from lcf3d.geometry.boxes import lidar_from_kitti
@@ -60,6 +61,7 @@ def study(
                 point.threshold,
                 point.counts,
                 fusion_outcomes(evaluator, provenance, calibrations, selection) if in_3d and calibrations else None,
+                _reliability(evaluator, selection),
             )
         )
     wrong, missed = _errors(evaluator, points)
@@ -71,8 +73,19 @@ def study(
         tuple(classes),
         wrong,
         missed,
-        partial(_boxes, evaluator, tuple(points), camera_from_lidar),
+        partial(_boxes, evaluator, tuple(points), camera_from_lidar, provenance),
+        lambda number: provenance.get(evaluator.truth.frame_ids[number]),
     )
+
+
+def _reliability(evaluator: KittiEvaluator, selection: Selection) -> tuple[ReliabilityBin, ...]:
+    """Of the scores of all detections that count, at whatever score."""
+    scores = evaluator.results.objects.scores
+    if scores is None:
+        return ()
+    _, outcomes = evaluator.match_at(selection, -np.inf)
+    judged = np.isin(outcomes, [TRUE_POSITIVE, FALSE_POSITIVE])
+    return reliability(scores[judged], outcomes[judged] == TRUE_POSITIVE)
 
 
 def _errors(evaluator: KittiEvaluator, points: list[WorkingPoint]) -> tuple[IntArray, IntArray]:
@@ -90,11 +103,14 @@ def _boxes(
     evaluator: KittiEvaluator,
     points: tuple[WorkingPoint, ...],
     camera_from_lidar: Callable[[str], FloatArray],
+    provenance: Mapping[str, FusedDetections],
     frame: int,
 ) -> list[ShownBox]:
     """What there is to draw of a frame."""
     truth, results = evaluator.truth, evaluator.results
     transform = camera_from_lidar(truth.frame_ids[frame])
+    fused = provenance.get(truth.frame_ids[frame])
+    output_of = None if fused is None else dict(same_detections(results[frame], fused))
     shown = []
     for point in points:
         codes, _ = evaluator.codes(point.selection)
@@ -108,7 +124,9 @@ def _boxes(
             if verdict == BELOW or results.objects.class_names[row].lower() != point.selection.class_name.lower():
                 continue
             outcome = {TRUE_POSITIVE: "right", FALSE_POSITIVE: "wrong"}.get(verdict, "ignored")
-            shown.append(_shown(results.objects, row, outcome, int(row - first), transform))
+            own = int(row - first)
+            output = own if output_of is None else output_of.get(own, -1)
+            shown.append(_shown(results.objects, row, outcome, output, transform))
     return shown
 
 

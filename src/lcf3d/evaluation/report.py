@@ -1,29 +1,36 @@
-"""One HTML file that shows an evaluation: tables, plots, and the worst frames, with nothing loaded from elsewhere."""
+"""One HTML file that shows an evaluation: tables, charts, every frame, with nothing loaded from elsewhere."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
-from html import escape
+from dataclasses import dataclass, field
+from importlib.resources import files
+from typing import Any
 
+import numpy as np
+
+from lcf3d.datasets.base import Dataset
 from lcf3d.evaluation.protocol import ComparisonRow, TableData
-from lcf3d.evaluation.study import ClassStudy, Study
-from lcf3d.evaluation.svg import PALETTE, Line, line_chart
-
-_STYLE = """
-body { font: 15px/1.5 system-ui, sans-serif; color: #0f172a; max-width: 1080px; margin: 2em auto; padding: 0 1em; }
-h1 { font-size: 1.5em; } h2 { font-size: 1.15em; margin-top: 2em; border-bottom: 1px solid #e2e8f0; }
-h3 { font-size: 1em; margin: 1.2em 0 .3em; }
-table { border-collapse: collapse; margin: .8em 0; font-variant-numeric: tabular-nums; }
-th, td { padding: .2em .8em; border-bottom: 1px solid #e2e8f0; text-align: right; } th { color: #475569; }
-th:first-child, td:first-child, td.text { text-align: left; }
-.plots { display: flex; flex-wrap: wrap; gap: 1.5em; } figure { margin: 0; } figcaption { font-weight: 600; }
-.note { color: #475569; max-width: 46em; } .good { color: #047857; } .bad { color: #b91c1c; }
-.picture { display: block; width: 1040px; max-width: 100%; margin-bottom: .5em; }
-.key span { display: inline-block; margin-right: 1.2em; } .key i { display: inline-block; width: 1em; height: .7em;
-  border: 2px solid; margin-right: .4em; }
-"""
+from lcf3d.evaluation.report_data import LIMIT_BYTES, report_data
+from lcf3d.evaluation.study import Study
 
 _OUTCOME_COLUMNS = ("matched", "recovered", "downweighted", "kept", "unknown")
+
+
+@dataclass(frozen=True)
+class Section:
+    """Tables under a heading.
+
+    Attributes:
+        heading: of the section.
+        tables: below it.
+        note: a sentence on all of them.
+    """
+
+    heading: str
+    tables: list[TableData] = field(default_factory=list)
+    note: str = ""
 
 
 def html_report(
@@ -31,7 +38,10 @@ def html_report(
     studies: Sequence[Study],
     tables: Sequence[Sequence[TableData]],
     comparison: Sequence[ComparisonRow] = (),
-    pictures: Mapping[str, str] | None = None,
+    dataset: Dataset | None = None,
+    worst: int = 8,
+    origin: Mapping[str, str] | None = None,
+    limit_bytes: int = LIMIT_BYTES,
 ) -> str:
     """The report as the text of an HTML file.
 
@@ -40,196 +50,175 @@ def html_report(
         studies: one result set, or two to be shown side by side.
         tables: the official numbers of each.
         comparison: rows of `lcf3d.evaluation.protocol.Evaluation.compare`, for two.
-        pictures: HTML of each of the worst frames, by heading, of the last result set.
+        dataset: where images and scans of the worst frames come from; none are shown without it.
+        worst: frames of the last result set with pictures.
+        origin: what made the report, for its foot: version, command and so on, by name.
+        limit_bytes: the largest size; pictures are left out first.
     """
-    main = studies[-1]
-    parts = [f"<h1>{escape(title)}</h1>", f"<p class='note'>{_introduction(studies)}</p>"]
-    for study, own in zip(studies, tables, strict=True):
-        parts += [f"<h2>Average precision{_of(study, studies)}</h2>", *map(_official_table, own)]
-    if comparison:
-        parts += ["<h2>Side by side</h2>", _comparison_table(comparison, [study.name for study in studies])]
-    parts += ["<h2>AP over the matching threshold, and precision over recall</h2>", _plots(studies)]
-    if any(part.distance for part in main.classes):
-        parts += ["<h2>By distance</h2>", *(_distance_table(study, studies) for study in studies), _DISTANCE_NOTE]
-    parts += ["<h2>At the best F1</h2>", *(_outcome_table(study, studies) for study in studies)]
-    fused = [study for study in studies if any(part.fusion for part in study.classes)]
-    if fused:
-        parts += ["<h2>What the fusion did</h2>", *(_fusion_tables(study, studies) for study in fused)]
-    if pictures:
-        parts += [f"<h2>Worst frames{_of(main, studies)}</h2>", _KEY]
-        frames = (f"<div><h3>{escape(heading)}</h3>{body}</div>" for heading, body in pictures.items())
-        parts += [f"<div class='plots'>{''.join(frames)}</div>"]
-    return (
-        f"<!doctype html><html lang='en'><head><meta charset='utf-8'><title>{escape(title)}</title>"
-        f"<meta name='viewport' content='width=device-width'><style>{_STYLE}</style></head><body>"
-        + "\n".join(parts)
-        + "</body></html>\n"
+    data = report_data(studies, dataset, worst, limit_bytes)
+    return render(title, studies, tables, comparison, data, origin or {}, limit_bytes)
+
+
+def render(
+    title: str,
+    studies: Sequence[Study],
+    tables: Sequence[Sequence[TableData]],
+    comparison: Sequence[ComparisonRow],
+    data: Mapping[str, Any],
+    origin: Mapping[str, str],
+    limit_bytes: int | None = None,
+) -> str:
+    """The page around what `report_data` gives; for the others see `html_report`."""
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    environment = Environment(
+        loader=PackageLoader("lcf3d.evaluation", "assets"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    sections = [
+        *(Section(f"Average precision{_of(s, studies)}", list(own)) for s, own in zip(studies, tables, strict=True)),
+        *_distance_section(studies),
+        Section("At the best F1", [_outcome_table(study, studies) for study in studies]),
+        *_fusion_section(studies),
+    ]
+    return environment.get_template("report.html").render(
+        title=title,
+        introduction=_introduction(studies),
+        sections=sections,
+        body_of=_body,
+        foot_of=_foot,
+        names=[study.name for study in studies],
+        comparison=comparison,
+        reach=_reach(comparison),
+        data=_script_json(data),
+        left_out=data["left_out"],
+        shown=len(data["frames"]),
+        pictured=len(data["pictures"]),
+        limit="" if limit_bytes is None else f"{limit_bytes / 1e6:g} MB",
+        origin=origin,
+        assets={name: asset(name) for name in ("report.css", "report.js", "scene.js", "uplot.css", "uplot.js")},
     )
 
 
-_DISTANCE_NOTE = "<p class='note'>In brackets the number of objects.</p>"
-OUTCOME_COLORS = {"right": "#2563eb", "wrong": "#dc2626", "missed": "#d97706", "found": "#16a34a", "ignored": "#94a3b8"}
-_KEY = (
-    "<p class='key'>"
-    + "".join(
-        f"<span><i style='border-color:{OUTCOME_COLORS[name]};border-style:{style}'></i>{text}</span>"
-        for name, style, text in (
-            ("found", "dashed", "object, found"),
-            ("missed", "dashed", "object, missed"),
-            ("right", "solid", "detection, right"),
-            ("wrong", "solid", "detection, wrong"),
-            ("ignored", "solid", "does not count"),
-        )
-    )
-    + "</p>"
-)
+def asset(name: str) -> str:
+    """The text of a file that the page is made of."""
+    return files("lcf3d.evaluation").joinpath("assets", name).read_text(encoding="utf-8")
+
+
+def _script_json(value: Any) -> str:
+    """JSON that no text in it can end the element of, wherever it comes from."""
+    text = json.dumps(value, separators=(",", ":"), allow_nan=False)
+    return text.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e")
 
 
 def _introduction(studies: Sequence[Study]) -> str:
     measures = dict.fromkeys(part.measure for study in studies for part in study.classes)
     return (
-        f"{escape(studies[0].heading)} over {len(studies[0].frame_ids)} frames, average precision in percent. The "
-        f"closer looks below are measured as: {escape('; '.join(measures) or 'nothing')}."
+        f"{studies[0].heading} over {len(studies[0].frame_ids)} frames, average precision in percent. The closer "
+        f"looks below are measured as: {'; '.join(measures) or 'nothing'}."
     )
 
 
 def _of(study: Study, studies: Sequence[Study]) -> str:
-    return f" of {escape(study.name)}" if len(studies) > 1 else ""
+    return f" of {study.name}" if len(studies) > 1 else ""
 
 
-def _official_table(table: TableData) -> str:
-    rows = [list(row) for row in table.rows if row is not None]
-    notes = "".join(f"<p class='note'>{escape(note)}</p>" for note in table.notes)
-    return f"<h3>{escape(table.title)}</h3>{_table([c.replace(chr(10), ' ') for c in table.columns], rows)}{notes}"
+def _reach(rows: Sequence[ComparisonRow]) -> float:
+    """The largest difference that any interval reaches, for the bars that show them."""
+    ends = [abs(value) for row in rows for value in (row.difference.low, row.difference.high) if np.isfinite(value)]
+    return max([*ends, 1e-9])
 
 
-def _comparison_table(rows: Sequence[ComparisonRow], names: Sequence[str]) -> str:
-    body = []
-    for row in rows:
-        sure = row.difference.low > 0 or row.difference.high < 0
-        style = ("good" if row.difference.value > 0 else "bad") if sure else "note"
-        body.append(
-            [
-                escape(row.class_name),
-                escape(row.measure),
-                escape(row.level),
-                f"{row.first.value:.2f}",
-                f"{row.second.value:.2f}",
-                f"<span class='{style}'>{row.difference.value:+.2f}</span>",
-                f"{row.difference.low:+.2f} to {row.difference.high:+.2f}",
-            ]
-        )
-    header = ["class", "measure", "level", *map(escape, names), "difference", "95 % interval"]
-    note = (
-        "The interval is that of the difference when the frames are drawn again with replacement, the same draw for "
-        "both; a difference is coloured where the interval leaves out zero."
-    )
-    return _table(header, body, raw=True) + f"<p class='note'>{note}</p>"
+def _distance_section(studies: Sequence[Study]) -> list[Section]:
+    tables = []
+    for study in studies:
+        parts = [part for part in study.classes if part.distance]
+        if not parts:
+            continue
+        ranges = [(row.near, row.far) for row in parts[0].distance]
+        columns = ["class" + _of(study, studies)]
+        columns += [f"{near:g} m and more" if far == float("inf") else f"{near:g} to {far:g} m" for near, far in ranges]
+        rows: list[tuple[str, ...] | None] = [
+            (part.class_name, *(f"{row.ap:.2f} ({row.objects})" for row in part.distance)) for part in parts
+        ]
+        tables.append(TableData("", tuple(columns), rows))
+    return [Section("By distance", tables, "In brackets the number of objects.")] if tables else []
 
 
-def _plots(studies: Sequence[Study]) -> str:
-    names = tuple(dict.fromkeys(part.class_name for study in studies for part in study.classes))
-    colors = dict(zip(names, PALETTE, strict=False))
-    over, curves = [], []
-    for index, study in enumerate(studies):
-        for part in study.classes:
-            name = part.class_name
-            label = name if len(studies) == 1 else f"{name}, {study.name}"
-            dashed = index < len(studies) - 1
-            color, thresholds = colors.get(name, PALETTE[0]), list(part.ap_over_threshold)
-            over.append(Line(label, thresholds, list(part.ap_over_threshold.values()), color, dashed))
-            curves.append(Line(label, part.recall, part.precision, color, dashed))
-    kinds = dict.fromkeys(part.threshold_name for study in studies for part in study.classes)
-    kind = " and ".join(kinds) or "threshold"
-    reach = max((x for line in over for x in line.x), default=1.0)
-    charts = {
-        f"AP over the {kind}": line_chart(
-            over, kind, "AP, %", (0, max(1.0, float(reach))), (0, 100), width=500, markers=True
-        ),
-        "Precision over recall": line_chart(curves, "recall", "precision", (0, 1), (0, 1), width=500),
-    }
-    figures = "".join(f"<figure><figcaption>{name}</figcaption>{svg}</figure>" for name, svg in charts.items())
-    return f"<div class='plots'>{figures}</div>"
-
-
-def _distance_table(study: Study, studies: Sequence[Study]) -> str:
-    parts = [part for part in study.classes if part.distance]
-    if not parts:
-        return ""
-    ranges = [(row.near, row.far) for row in parts[0].distance]
-    header = ["class" + _of(study, studies)]
-    header += [f"{near:g} m and more" if far == float("inf") else f"{near:g} to {far:g} m" for near, far in ranges]
-    rows = [[escape(part.class_name), *(f"{row.ap:.2f} ({row.objects})" for row in part.distance)] for part in parts]
-    return _table(header, rows, raw=True)
-
-
-def _outcome_table(study: Study, studies: Sequence[Study]) -> str:
-    rows = []
+def _outcome_table(study: Study, studies: Sequence[Study]) -> TableData:
+    rows: list[tuple[str, ...] | None] = []
     for part in study.classes:
-        counts = part.counts
-        hits, wrong, missed = counts.values()
-        precision, recall = _ratio(hits, hits + wrong), _ratio(hits, hits + missed)
-        name = escape(part.class_name)
-        rows.append([name, f"{part.score_threshold:.3g}", *map(str, (hits, wrong, missed)), precision, recall])
-    header = ["class" + _of(study, studies), "score from", "right", "wrong", "missed", "precision", "recall"]
-    return _table(header, rows, raw=True)
+        hits, wrong, missed = part.counts.values()
+        shares = _ratio(hits, hits + wrong), _ratio(hits, hits + missed)
+        rows.append((part.class_name, f"{part.score_threshold:.3g}", *map(str, (hits, wrong, missed)), *shares))
+    columns = ("class" + _of(study, studies), "score from", "right", "wrong", "missed", "precision", "recall")
+    return TableData("", columns, rows)
 
 
-def _fusion_tables(study: Study, studies: Sequence[Study]) -> str:
-    parts = [part for part in study.classes if part.fusion]
-    reported = [p.fusion.true_positives | p.fusion.false_positives for p in parts if p.fusion]
-    used = [column for column in _OUTCOME_COLUMNS if any(column in counts for counts in reported)]
-    outputs = [row for part in parts for row in _output_rows(part, used)]
-    dropped = [row for part in parts for row in _dropped_rows(part)]
-    kinds = ("dropped", "below_threshold", "not_proposed")
-    misses = [[p.class_name, *(str(p.fusion.misses[kind]) for kind in kinds)] for p in parts if p.fusion]
-    note = (
-        "At the scores of the table above. Dropped rightly: the dropped LiDAR detection fits no object, or one that is "
-        "reported anyway. Dropped wrongly: it fits an object that is now missed."
-    )
-    title = f"<h3>{escape(study.name)}</h3>" if len(studies) > 1 else ""
-    return (
-        title
-        + f"<p class='note'>{note}</p>"
-        + _table(["reported detections", "", *used], outputs)
-        + _table(["dropped LiDAR detections", "reason", "rightly", "wrongly"], dropped)
-        + _table(
-            ["missed objects", "dropped by the fusion", "reported with a lower score", "no detection fits"], misses
+def _fusion_section(studies: Sequence[Study]) -> list[Section]:
+    tables = [t for study in studies for t in _fusion_tables(study, studies)]
+    return [Section("What the fusion did", tables, _FUSION_NOTE)] if tables else []
+
+
+_FUSION_NOTE = (
+    "At the scores of the table above. Dropped rightly: the dropped LiDAR detection fits no object, or one that is "
+    "reported anyway. Dropped wrongly: it fits an object that is now missed."
+)
+
+
+def _fusion_tables(study: Study, studies: Sequence[Study]) -> list[TableData]:
+    """Reported detections, dropped ones and missed objects by what the fusion did; nothing without provenance."""
+    parts = [(part.class_name, part.fusion) for part in study.classes if part.fusion is not None]
+    if not parts:
+        return []
+    used = [c for c in _OUTCOME_COLUMNS if any(c in f.true_positives or c in f.false_positives for _, f in parts)]
+    outputs = [
+        (name, label, *(str(counts.get(column, 0)) for column in used))
+        for name, fusion in parts
+        for label, counts in (("right", fusion.true_positives), ("wrong", fusion.false_positives))
+    ]
+    dropped = [
+        (
+            name,
+            reason.replace("_", " "),
+            str(fusion.dropped_rightly.get(reason, 0)),
+            str(fusion.dropped_wrongly.get(reason, 0)),
         )
-    )
-
-
-def _output_rows(part: ClassStudy, used: Sequence[str]) -> list[list[str]]:
-    if part.fusion is None:
-        return []
-    groups = {"right": part.fusion.true_positives, "wrong": part.fusion.false_positives}
+        for name, fusion in parts
+        for reason in sorted({*fusion.dropped_rightly, *fusion.dropped_wrongly})
+    ]
+    kinds = ("dropped", "below_threshold", "not_proposed")
+    misses = [(name, *(str(fusion.misses.get(kind, 0)) for kind in kinds)) for name, fusion in parts]
+    of = _of(study, studies)
     return [
-        [part.class_name, name, *(str(counts.get(column, 0)) for column in used)] for name, counts in groups.items()
+        TableData(f"Reported detections{of}", ("class", "", *used), list(outputs)),
+        TableData(f"Dropped LiDAR detections{of}", ("class", "reason", "rightly", "wrongly"), list(dropped)),
+        TableData(
+            f"Missed objects{of}",
+            ("class", "dropped by the fusion", "reported with a lower score", "no detection fits"),
+            list(misses),
+        ),
     ]
 
 
-def _dropped_rows(part: ClassStudy) -> list[list[str]]:
-    if part.fusion is None:
-        return []
-    right, wrong = part.fusion.dropped_rightly, part.fusion.dropped_wrongly
-    return [
-        [part.class_name, reason.replace("_", " "), str(right.get(reason, 0)), str(wrong.get(reason, 0))]
-        for reason in sorted({*right, *wrong})
-    ]
+def _body(table: TableData) -> list[tuple[str, ...]]:
+    """Rows up to the one that sums up; a first cell left empty says what the row above says, so that rows can move."""
+    rows: list[tuple[str, ...]] = []
+    for row in table.rows:
+        if row is None:
+            break
+        rows.append((rows[-1][0], *row[1:]) if rows and not row[0] else row)
+    return rows
 
 
-def _ratio(part: int, whole: int) -> str:
-    return f"{part / whole:.3f}" if whole else "–"
+def _foot(table: TableData) -> list[tuple[str, ...]]:
+    """The rows that sum up."""
+    place = table.rows.index(None) if None in table.rows else len(table.rows)
+    return [row for row in table.rows[place:] if row is not None]
 
 
-def _table(header: Sequence[str], rows: Sequence[Sequence[str]], raw: bool = False) -> str:
-    """An HTML table, nothing without rows; ``raw`` cells are HTML already."""
-    if not rows:
-        return ""
-
-    def cell(text: str) -> str:
-        return text if raw else escape(text)
-
-    head = "".join(f"<th>{cell(text)}</th>" for text in header)
-    body = "".join("<tr>" + "".join(f"<td>{cell(text)}</td>" for text in row) + "</tr>" for row in rows)
-    return f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
+def _ratio(count: int, total: int) -> str:
+    return f"{count / total:.3f}" if total else "-"

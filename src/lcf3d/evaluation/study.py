@@ -8,6 +8,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from lcf3d.evaluation.reliability import ReliabilityBin, calibration_error
+from lcf3d.provenance import FusedDetections
 from lcf3d.structures import FloatArray, IntArray
 
 DISTANCE_RANGES = ((0.0, 20.0), (20.0, 40.0), (40.0, float("inf")))
@@ -72,6 +74,7 @@ class ClassStudy:
         score_threshold: score of the best F1; infinite without any true positive.
         counts: ``true_positives``, ``false_positives`` and ``misses`` there.
         fusion: the outcomes split by what the fusion did, or None without provenance.
+        reliability: of the scores of all detections that count; empty where they are no probabilities.
     """
 
     class_name: str
@@ -85,9 +88,10 @@ class ClassStudy:
     score_threshold: float
     counts: Mapping[str, int]
     fusion: FusionOutcomes | None
+    reliability: tuple[ReliabilityBin, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
-        """Plain JSON values, without infinities."""
+        """Plain JSON values, None for what is infinite or not a number."""
         values: dict[str, Any] = {
             "measure": self.measure,
             "threshold": self.threshold_name,
@@ -96,7 +100,7 @@ class ClassStudy:
                 {
                     "near_m": row.near,
                     "far_m": row.far if np.isfinite(row.far) else None,
-                    "AP": row.ap,
+                    "AP": row.ap if np.isfinite(row.ap) else None,
                     "objects": row.objects,
                 }
                 for row in self.distance
@@ -106,6 +110,11 @@ class ClassStudy:
                 **self.counts,
             },
         }
+        if self.reliability:
+            values["calibration"] = {
+                "expected_error": calibration_error(self.reliability),
+                "bins": [row._asdict() for row in self.reliability],
+            }
         if self.fusion is not None:
             values["fusion"] = self.fusion.to_json()
         return values
@@ -120,7 +129,8 @@ class ShownBox(NamedTuple):
         score: of a detection, None for a labelled object.
         box3d: (7,) in the LiDAR frame, or None without a 3D box.
         box2d: (4,) pixels of the first camera, or None where it is not in view.
-        output: index of the detection among those of its frame, None for a labelled object.
+        output: index of the detection among those of its frame (of the fusion's, where its provenance is there), None
+            for a labelled object.
     """
 
     class_name: str
@@ -144,6 +154,7 @@ class Study:
         wrong: (F,) false positives in each frame, over all classes at their working points.
         missed: (F,) missed objects in each frame.
         boxes: what there is to draw of a frame, by its number.
+        fused: the provenance of a frame, by its number; None where there is none.
     """
 
     name: str
@@ -154,6 +165,7 @@ class Study:
     wrong: IntArray
     missed: IntArray
     boxes: Callable[[int], list[ShownBox]]
+    fused: Callable[[int], FusedDetections | None] = lambda number: None
 
     def to_json(self) -> dict[str, Any]:
         """Plain JSON values."""

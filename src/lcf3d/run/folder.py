@@ -9,7 +9,8 @@ OUT/...                  results in the dataset's own form: data/ID.txt for KITT
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -148,6 +149,11 @@ class RunFolder:
         write_json(self.provenance_path(frame.id), fused.to_json(), indent=None)
         if self._writer is not None:
             self._writer.write(frame, fused)
+
+    @contextmanager
+    def shard(self) -> Iterator[None]:
+        """A stretch of frames that other forms of run folders write at once; here every frame has files of its own."""
+        yield
 
     def finish(self, frame_ids: Sequence[str]) -> None:
         """Write what belongs to all frames together, and let others write again."""

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import pickle
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field, replace
-from multiprocessing import get_context
+from multiprocessing import get_all_start_methods, get_context, get_start_method
 from time import perf_counter
 from typing import Any, Protocol
 
 from lcf3d.datasets.base import CameraSource, Dataset, LidarSource
-from lcf3d.errors import DatasetError
+from lcf3d.errors import ConfigError, DatasetError
 from lcf3d.fusion.alignment import Alignment
 from lcf3d.fusion.memory import remember
 from lcf3d.fusion.memory_config import MemoryConfig
@@ -22,6 +23,7 @@ from lcf3d.provenance import FusedDetections, Outcome, Reason
 from lcf3d.run.alignment import aligned_frame
 from lcf3d.run.folder import RunFolder
 from lcf3d.run.sources import DetectorOnFrames, LidarOnScans
+from lcf3d.run.table_folder import SHARD_FRAMES, TableRunFolder
 from lcf3d.structures import Detections2D, Detections3D, Frame
 
 
@@ -174,14 +176,20 @@ def summarize(frame_id: str, fused: FusedDetections, milliseconds: dict[str, flo
 _worker: FrameRunner
 
 
-def _start_worker(runner: FrameRunner) -> None:
+def _start_worker(runner: FrameRunner | bytes) -> None:
     global _worker
-    _worker = runner
+    _worker = pickle.loads(runner) if isinstance(runner, bytes) else runner
     end_with_parent()
 
 
 def _work(frame_ids: Sequence[str]) -> list[FrameSummary]:
-    return list(_worker.run_sequence(frame_ids))
+    return list(_shard(_worker, frame_ids))
+
+
+def _shard(runner: FrameRunner, frame_ids: Sequence[str]) -> Iterator[FrameSummary]:
+    """Summaries of the frames of one shard; its files are there when the last is taken."""
+    with runner.folder.shard():
+        yield from runner.run_sequence(frame_ids)
 
 
 def run_frames(
@@ -192,19 +200,27 @@ def run_frames(
     Args:
         runner: what to do with a frame.
         frame_ids: the frames.
-        jobs: processes; more than one pays where no detector runs, since those use all cores themselves.
+        jobs: processes; more than one pays where no detector runs, since those use all cores themselves. They start
+            as `multiprocessing.set_start_method` says, else by fork where there is such a thing.
         sequences: the same frames in groups that must not be taken apart; any frame can be apart without.
+
+    Raises:
+        ConfigError: processes cannot be forked, and what runs cannot be sent to them.
     """
-    if jobs <= 1:
-        for sequence in [frame_ids] if sequences is None else sequences:
-            yield from runner.run_sequence(sequence)
-        return
     if sequences is None:
-        size = max(1, min(16, len(frame_ids) // (4 * jobs)))
+        # tables have the same shards whatever the number of processes
+        tables = isinstance(runner.folder, TableRunFolder)
+        size = SHARD_FRAMES if tables else max(1, min(16, len(frame_ids) // (4 * jobs)))
         sequences = [frame_ids[start : start + size] for start in range(0, len(frame_ids), size)]
-    # by fork, so that results read once are shared and not sent
-    context = get_context("fork")
-    with ProcessPoolExecutor(jobs, mp_context=context, initializer=_start_worker, initargs=(runner,)) as pool:
+    if jobs <= 1:
+        for sequence in sequences:
+            yield from _shard(runner, sequence)
+        return
+    method = get_start_method(allow_none=True) or ("fork" if "fork" in get_all_start_methods() else "spawn")
+    # forked processes share what was read; others are sent it
+    sent = runner if method == "fork" else _pickled(runner)
+    context = get_context(method)
+    with ProcessPoolExecutor(jobs, mp_context=context, initializer=_start_worker, initargs=(sent,)) as pool:
         try:
             with workers("fusing: the frames that are done are kept, go on with --resume and fewer --jobs"):
                 for done in pool.map(_work, sequences):
@@ -212,6 +228,16 @@ def run_frames(
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise
+
+
+def _pickled(runner: FrameRunner) -> bytes:
+    try:
+        return pickle.dumps(runner)
+    except Exception as error:
+        raise ConfigError(
+            f"what this run is made of cannot be sent to other processes ({error}), and they cannot be forked here; "
+            "leave --jobs out, or start a process for each --shard i/n"
+        ) from None
 
 
 def total(summaries: Sequence[FrameSummary]) -> dict[str, Any]:

@@ -26,7 +26,9 @@ from lcf3d.run.folder import RunFolder
 from lcf3d.run.frames import FrameRunner
 from lcf3d.run.joins import FEW_FRAMES, left_out_counts, left_out_notes, report_notes, reported_classes
 from lcf3d.run.settings import build_config
+from lcf3d.run.shards import frames_of_shard
 from lcf3d.run.sources import CameraOnImages, DetectorOnFrames, LidarOnScans, open_cameras, open_lidar
+from lcf3d.run.table_folder import TableRunFolder, require_form
 
 log = logging.getLogger(__name__)
 
@@ -57,6 +59,8 @@ class RunRequest:
         missing: result files that are not there: ``error`` or ``empty``.
         memory: whether recent frames of a sequence testify too, see `lcf3d.fusion.memory`.
         smooth: whether later ones do as well, see `lcf3d.fusion.memory_smooth`.
+        shard: ``i/n``: only that part of the frames, see `lcf3d.run.shards`.
+        form: of the run folder: ``folder`` or ``parquet``.
     """
 
     dataset: str
@@ -75,6 +79,8 @@ class RunRequest:
     self_calibrate: bool = False
     memory: bool = False
     smooth: bool = False
+    shard: str | None = None
+    form: str = "folder"
 
 
 class Inputs(NamedTuple):
@@ -129,8 +135,13 @@ def prepare_run(
     Raises:
         Lcf3dError: anything wrong with the request, the dataset or the result files.
     """
+    require_form(request.form)
+    # a shard reads and calibrates like the whole run, so that its results are those of the whole
     dataset, frame_ids, config, lidar, cameras, localizer = read_inputs(request, settings=settings)
-    folder = RunFolder(out, dataset.writer(out))
+    own_ids = frames_of_shard(frame_ids, request.shard)
+    if request.shard is not None and (request.memory or request.smooth):
+        raise ConfigError("--shard takes drives apart, and --memory and --smooth need them whole; leave one out")
+    folder = TableRunFolder(out) if request.form == "parquet" else RunFolder(out, dataset.writer(out))
     memory = MemoryConfig() if request.memory or request.smooth else None
     fusion = make_fusion(config, localizer)
     runner = FrameRunner(dataset, lidar, cameras, fusion, folder, memory=memory, smooth=request.smooth)
@@ -165,7 +176,7 @@ def prepare_run(
     if calibration is not None:
         calibration.dump(folder.calibration_path)
     runner.fusion = make_fusion(config, localizer, calibration, reported)
-    return Run(dataset, frame_ids, config, runner, folder, notes)
+    return Run(dataset, own_ids, config, runner, folder, notes)
 
 
 def read_inputs(
