@@ -234,7 +234,7 @@ def read_coco_annotations(
     # polygons are no run-length masks
     named = [{k: v for k, v in r.items() if k != "segmentation" or isinstance(v, dict)} for r in named]
     looked_at = {place: Detections2D.empty(class_names) for place in images.values()}
-    return {**looked_at, **_group(path, named, lambda r: images[r["image_id"]], "category_name", class_names)}
+    return {**looked_at, **_group(path, named, lambda r: images[r["image_id"]], class_names, None)}
 
 
 def _records(path: Path) -> list[dict[str, Any]]:
