@@ -226,10 +226,10 @@ def folder_camera_results(
     form = form_of(path)
     if form == CAMERAS:
         return _Cameras(path, class_names, missing)
+    names = sorted({camera for _, camera in images.values()})
     if form == PLAIN:
-        return PlainCameraResults(path, class_names, missing)
+        return PlainCameraResults(path, class_names, missing, names)
     if form == KITTI:
-        names = sorted({camera for _, camera in images.values()})
         if len(names) > 1:
             raise DatasetError(
                 f"{path} does not say of which camera its .txt files are; put those of {', '.join(names)} each into a "
