@@ -62,7 +62,7 @@ def test_other_classes_are_counted_and_nothing_but_them_is_an_error(kitti: Path)
     (finding,) = [f for f in check_dataset(f"kitti:{kitti / 'kitti'}", kitti / "lidar") if f.id == "KIT13"]
     assert "Giraffe 2" in finding.message
     rewrite(kitti / "lidar", "^Car", "Giraffe")
-    with pytest.raises(DatasetError, match="Giraffe.*expected Car, Pedestrian, Cyclist"):
+    with pytest.raises(DatasetError, match=r"Giraffe.*expected Car, Pedestrian, Cyclist"):
         outputs(kitti)
 
 
