@@ -56,7 +56,8 @@ def demo(
 def _print(result: DemoResult, paths: list[Path]) -> None:
     from rich.console import Console
 
-    console = Console()
+    # paths and sentences of the fusion are no markup
+    console = Console(markup=False, highlight=False)
     console.print(_table(result))
     console.print(
         "matching: what the camera does not confirm is deleted (paper). weighed: it is doubted, see "

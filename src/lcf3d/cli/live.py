@@ -97,7 +97,7 @@ def _print(report: ReplayReport) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    console = Console()
+    console = Console(markup=False, highlight=False)
     console.print(
         f"{report.frames} frames in {report.seconds:.1f} s: {report.results} results, {report.behind} behind time"
     )

@@ -44,10 +44,10 @@ def simulate(
     from lcf3d.simulation.writer import Recipe, write_dataset
 
     recipe = Recipe(preset, frames, seed, sequence, street, density)
-    console = Console(stderr=True)
+    console = Console(stderr=True, markup=False, highlight=False)
     columns = (TextColumn("simulating"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console) as bar:
         task = bar.add_task("frames", total=frames)
         ids = write_dataset(recipe, out, jobs, resume, lambda n: bar.advance(task, n))
     layout = get_preset(preset).layout
-    console.print(f"{len(ids)} frames in {out}; look at one with: [bold]lcf3d view {layout}:{out}[/bold]")
+    console.print(f"{len(ids)} frames in {out}; look at one with: lcf3d view {layout}:{out}")

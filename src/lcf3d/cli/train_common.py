@@ -44,7 +44,7 @@ def train_with_progress(
 
     from lcf3d.training.loop import Progress, train
 
-    console = Console(stderr=True)
+    console = Console(stderr=True, markup=False, highlight=False)
     columns = (
         TextColumn("training"),
         BarColumn(),

@@ -79,6 +79,9 @@ def read_calibration(path: Path) -> KittiCalibration:
     for name in others:
         if name in entries:
             projections[name] = matrix_entry(path, entries, (name,), (3, 4))
+    for name in ("P2", "P3"):
+        if name in projections and not (projections[name][0, 0] > 0 and projections[name][1, 1] > 0):
+            raise FormatError(f"{path}: {name} has no focal length; expected the projection of a camera")
     lidar_from_imu = None
     if "Tr_imu_to_velo" in entries or "Tr_imu_velo" in entries:
         lidar_from_imu = np.eye(4)
@@ -194,6 +197,9 @@ def cameras_of(
             _check_image_size(images[name], size, matrix)
         else:
             known = sizes.get(name) or IMAGE_SIZES.get(round(float(matrix[0, 0]), 4)) or default_size
+            if known is None and images:
+                # the two cameras of a pair have images of one size
+                known = image_size(next(iter(images.values())))
             if known is None:
                 _require_default_size(name, matrix)
             size = known or DEFAULT_IMAGE_SIZE

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Protocol
@@ -10,6 +11,7 @@ import numpy as np
 
 from lcf3d.datasets.check import Finding
 from lcf3d.datasets.images import read_image
+from lcf3d.detectors.joins import join_classes
 from lcf3d.errors import Lcf3dError
 from lcf3d.formats.kitti import KittiObjects, read_objects
 from lcf3d.geometry.boxes import points_in_boxes
@@ -30,6 +32,7 @@ RULES = {
     "KIT10": "the result folder has a file for every frame",
     "KIT11": "result files are well-formed",
     "KIT12": "scores lie in [0, 1] (else a calibration is needed)",
+    "KIT13": "classes of results are KITTI's, without regard to case and with common other names",
 }
 LABEL_CLASSES = ("Car", "Van", "Truck", "Pedestrian", "Person_sitting", "Cyclist", "Tram", "Misc", "DontCare")
 # a label that is easy to see: at least so many pixels high, not truncated, not occluded
@@ -197,14 +200,22 @@ def check_results(frame_ids: Sequence[str], folder: Path) -> Iterator[Finding]:
             "KIT10", "error", f"{folder} lacks {len(missing)} of {len(frame_ids)} frames, first {missing[0]}.txt"
         )
     low, high = np.inf, -np.inf
+    classes: Counter[str] = Counter()
     for frame_id in sorted(set(frame_ids) - set(missing)):
         try:
-            scores = read_objects(folder / f"{frame_id}.txt", results=True).scores
+            objects = read_objects(folder / f"{frame_id}.txt", results=True)
+            scores = objects.scores
+            classes.update(objects.class_names.tolist())
         except Lcf3dError as error:
             yield Finding("KIT11", "error", str(error))
             continue
         if scores is not None and len(scores):
             low, high = min(low, float(scores.min())), max(high, float(scores.max()))
+    joined = join_classes(classes, LABEL_CLASSES)
+    unknown = {name: count for name, count in classes.items() if name not in joined}
+    if unknown:
+        listed = ", ".join(f"{name} {count}" for name, count in unknown.items())
+        yield Finding("KIT13", "warning", f"{folder}: detections of classes that KITTI does not have: {listed}")
     if low < 0 or high > 1:
         yield Finding(
             "KIT12", "warning", f"{folder}: scores go from {low:.4g} to {high:.4g}; fit one with 'lcf3d calibrate'"

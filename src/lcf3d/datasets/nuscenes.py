@@ -25,7 +25,7 @@ from lcf3d.datasets.nuscenes_loading import find_version, load_tables
 from lcf3d.datasets.nuscenes_splits import scenes_of_split
 from lcf3d.datasets.nuscenes_tables import CAMERAS, MAX_CAMERA_DELAY_S, NuscenesTables
 from lcf3d.detectors.lidar.sweeps import accumulate_sweeps
-from lcf3d.errors import ConfigError, DatasetError
+from lcf3d.errors import ConfigError, DatasetError, Lcf3dError
 from lcf3d.files import inside
 from lcf3d.formats.nuscenes import read_submission, write_submission
 from lcf3d.formats.nuscenes_boxes import (
@@ -194,7 +194,16 @@ class NuscenesDataset(BaseDataset):
         """The rules ``NUS``."""
         from lcf3d.datasets.nuscenes_check import check_nuscenes
 
-        return check_nuscenes(self.root, self.version)
+        findings = check_nuscenes(self.root, self.version)
+        if results is None:
+            return findings
+        try:
+            found = self.lidar_results(results, self.class_names)
+            found.load(self.ids)  # type: ignore[attr-defined]
+        except Lcf3dError as error:
+            return [*findings, Finding("NUS13", "error", str(error))]
+        notes = found.left_out.notes()  # type: ignore[attr-defined]
+        return [*findings, *(Finding("NUS14", "warning", note) for note in notes)]
 
     def points(self, token: str) -> NDArray[np.float32]:
         """(N, 4) ``x, y, z, intensity`` of a sample in the canonical frame; with sweeps (N, 5), last the age in s.

@@ -14,6 +14,8 @@
 | NUS10 | warning | camera and LiDAR of a sample are too far apart in time |
 | NUS11 | warning | sensor files of key frames are absent |
 | NUS12 | warning | a sensor's recordings are not in order of time |
+| NUS13 | error | the result file cannot be read, lacks samples, or nothing in it fits the dataset |
+| NUS14 | warning | detections of the result file are left out: other samples or classes |
 """
 
 from __future__ import annotations

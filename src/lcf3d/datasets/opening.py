@@ -52,6 +52,8 @@ def check_dataset(
     Raises:
         Lcf3dError: it cannot be opened, and cannot say by rules what is wrong.
     """
+    if results is not None and not results.exists():
+        raise DatasetError(f"{results} does not exist; name a file or folder of results")
     try:
         dataset = open_dataset(text, **settings)
     except Lcf3dError:

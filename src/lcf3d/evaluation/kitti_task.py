@@ -31,6 +31,7 @@ from lcf3d.evaluation.protocol import ComparisonRow, EvaluationOptions, TableDat
 from lcf3d.evaluation.study import Study
 from lcf3d.files import list_files
 from lcf3d.formats.kitti import (
+    NO_ANGLE,
     KittiFrames,
     KittiObjects,
     objects_from_detections,
@@ -41,6 +42,9 @@ from lcf3d.geometry.camera import project_boxes
 from lcf3d.structures import Detections2D, Detections3D, FloatArray, Frame
 
 Measure = Literal["3d", "bbox"]
+
+# pixels; lower boxes are ignored at every difficulty
+LEAST_HEIGHT = 25
 
 
 class KittiEvaluation:
@@ -159,6 +163,7 @@ class KittiEvaluation:
                 f"{len(others)} result files in {folder} are of frames outside the split, first {others[0]}.txt; "
                 "they are left out"
             )
+        notes += _why_nothing_counts(results.objects)
         evaluator = KittiEvaluator(self.truth, results, self.config)
         return KittiResultSet(name, path, evaluator, self.dataset, tuple(notes))
 
@@ -310,3 +315,25 @@ def _of_classes(lines: KittiObjects, class_names: Sequence[str], in_3d: bool) ->
     """The lines that become detections: of these classes, and with a 3D box where that matters."""
     kept = np.isin(lines.class_names, list(class_names))
     return lines[kept & lines.has_box3d] if in_3d else lines[kept]
+
+
+def _why_nothing_counts(found: KittiObjects) -> list[str]:
+    """What makes the official program pass over all detections, one sentence each; nothing where some count."""
+    if not len(found):
+        return ["the result files hold no detections at all: every AP is 0"]
+    notes = []
+    heights = found.boxes2d[:, 3] - found.boxes2d[:, 1]
+    if not heights.any():
+        notes.append(
+            "no detection has a 2D box: the official program takes all of them as too low to count, so every AP is 0; "
+            "write the projections of the 3D boxes into columns 5 to 8"
+        )
+    elif (heights < LEAST_HEIGHT).all():
+        notes.append(f"all 2D boxes are lower than {LEAST_HEIGHT} pixels, which the official program does not count")
+    if not found.has_box3d.any():
+        notes.append("no detection has a 3D box: BEV and 3D are not evaluated")
+    elif (found.rotation_y == NO_ANGLE).all():
+        notes.append("rotation_y of all detections is -10, which means unknown: BEV and 3D overlaps are wrong")
+    if (found.alpha == NO_ANGLE).all():
+        notes.append("alpha of all detections is -10, which means unknown: orientation (AOS) is not evaluated")
+    return notes

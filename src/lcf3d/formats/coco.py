@@ -23,6 +23,10 @@ CameraDetections = dict[tuple[str, str], Detections2D]
 """Detections by (frame id, camera name)."""
 
 
+MOST_MASK_PIXELS = 64_000_000
+"""Larger masks are refused unread."""
+
+
 def decode_mask(segmentation: Mapping[str, Any]) -> NDArray[np.bool_]:
     """(H, W) mask of a COCO run-length encoding.
 
@@ -40,6 +44,8 @@ def decode_mask(segmentation: Mapping[str, Any]) -> NDArray[np.bool_]:
         raise FormatError("a mask must be a COCO run-length encoding {'size': [h, w], 'counts': ...}") from None
     if height < 0 or width < 0 or runs.ndim != 1 or (runs < 0).any() or runs.sum() != height * width:
         raise FormatError(f"the runs of a mask add up to {runs.sum()} pixels, its size is {height} x {width}")
+    if height * width > MOST_MASK_PIXELS:
+        raise FormatError(f"a mask of {height} x {width} pixels is larger than any image")
     values = np.zeros(len(runs), dtype=bool)
     values[1::2] = True
     return np.repeat(values, runs).reshape(width, height).T

@@ -131,7 +131,7 @@ class RunFolder:
         """What the run that the folder holds has written, but for what lies behind a link or is of no frame of it."""
         frames = set(self.frame_ids())
         results = [] if self._writer is None else list(self._writer.written())
-        own = [file for file in results if file.parent == self.path or file.stem in frames]
+        own = [file for file in results if file.parent.name != "data" or file.stem in frames]
         own += [*(self.provenance_path(frame_id) for frame_id in frames), self.calibration_path, self.alignment_path]
         return [file for file in own if not _behind_link(file, self.path)]
 

@@ -97,7 +97,16 @@ def write_dataset(
         raise ConfigError(f"jobs must be 1 or more, got {jobs}")
     if find_spec("embreex") is None:
         raise MissingExtraError("embreex", "simulate", "the simulation")
-    _prepare(recipe, root, resume)
+    try:
+        _prepare(recipe, root, resume)
+        return _write(recipe, root, jobs, progress)
+    finally:
+        if not root.is_file():
+            unlock_folder(root)
+
+
+def _write(recipe: Recipe, root: Path, jobs: int, progress: Callable[[int], None]) -> list[str]:
+    """Write the frames that are missing, and what belongs to all; returns the ids of all frames."""
     layout = _layout(recipe)
     ids = [recipe.id(k) for k in range(recipe.frames)]
     missing = [k for k in range(recipe.frames) if not layout.is_complete(root, ids[k])]
@@ -115,7 +124,6 @@ def write_dataset(
             nuscenes_layout.write_tables(root, ids, recipe.seed)
     except OSError as error:
         raise _write_error(root, error) from error
-    unlock_folder(root)
     return ids
 
 
