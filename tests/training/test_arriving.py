@@ -4,12 +4,12 @@ import pytest
 
 pytest.importorskip("torch")
 
-import numpy as np  # noqa: E402
+import numpy as np
 
-from lcf3d.errors import FormatError  # noqa: E402
-from lcf3d.structures import KITTI_CLASSES  # noqa: E402
-from lcf3d.training.arriving import Arrivals, ArrivingLidar, is_held_out, localizer_of  # noqa: E402
-from tests.training.lidar_scenes import CONFIG, scene  # noqa: E402
+from lcf3d.errors import FormatError
+from lcf3d.structures import KITTI_CLASSES
+from lcf3d.training.arriving import Arrivals, ArrivingLidar, is_held_out, localizer_of
+from tests.training.lidar_scenes import CONFIG, scene
 
 
 def prepare(path):

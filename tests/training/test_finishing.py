@@ -28,7 +28,7 @@ def test_halves_share_no_sample_and_fit_the_time():
 def test_without_held_out_samples_there_is_a_network_and_no_figure(name, file, tmp_path):
     pytest.importorskip("onnx")
     torch.manual_seed(0)
-    weights = {key: value for key, value in fresh(name).state_dict().items()}
+    weights = dict(fresh(name).state_dict())
     torch.save({"format": TRAINING_FORMAT, "averaged": weights}, tmp_path / "weights.pt")
     network = network_of(name, tmp_path / "weights.pt")
     assert not network.training
