@@ -33,7 +33,7 @@ from lcf3d.simulation import capture, get_preset
 from lcf3d.simulation.scene import build_scene
 from lcf3d.structures import KITTI_CLASSES, Camera, Detections3D, Frame
 
-SEED = 3001
+SEED = 3201
 PRESETS = ("kitti64", "sparse16", "nuscenes32")
 CAMERA_SETTINGS = {"kitti64": "", "sparse16": "", "nuscenes32": "?size=448x800"}
 

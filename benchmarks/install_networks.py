@@ -67,8 +67,12 @@ def simulate(root: Path, preset: str, count: int) -> None:
     }
     for folder in recipes:
         folder.mkdir(parents=True, exist_ok=True)
+    other = {root / "nuscenes": SampleRecipe("lidar", "nuscenes32", 1, SEED + 2)}
+    (root / "nuscenes").mkdir(exist_ok=True)
     for index in range(count):
         write_scene_samples(recipes, index)
+    for index in range(count // 2):
+        write_scene_samples(other, index)
 
 
 def samples(root: Path, sensor: str, odd: bool) -> list[Path]:

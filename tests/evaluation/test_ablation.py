@@ -1,8 +1,13 @@
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from lcf3d import FusionConfig
+from lcf3d.cli.ablate import ablation_table
+from lcf3d.errors import ConfigError
 from lcf3d.evaluation.ablation import MODULES, AblationInput, ablate, suppressed, variants
+from lcf3d.evaluation.bootstrap import Interval
 from lcf3d.evaluation.calibration_study import open_study
 from lcf3d.fusion.self_calibration import self_calibrate
 from lcf3d.run.setup import RunRequest
@@ -20,9 +25,9 @@ def rows(tmp_path_factory):
         RunRequest(f"kitti:{root}", f"results:{lidar}", {"*": f"results:{camera}"}, "val", config="kitti"), folds=0
     )
     inputs = [AblationInput(*i) for i in zip(study.frames, study.lidar_inputs, study.camera_inputs, strict=True)]
-    return {
-        (row.group, row.name): row for row in ablate(inputs, study.evaluation, CONFIG, self_calibrate(inputs, CONFIG))
-    }
+    calibration = self_calibrate(inputs, CONFIG)
+    measured = ablate(inputs, study.evaluation, CONFIG, calibration, samples=50)
+    return {(row.group, row.name): row for row in measured}
 
 
 def test_lidar_alone_and_the_filter(rows):
@@ -34,6 +39,23 @@ def test_lidar_alone_and_the_filter(rows):
     assert matching.ap["Car"][1] > alone.ap["Car"][1] + 5
     assert matching.ap["Cyclist"] == pytest.approx(alone.ap["Cyclist"])
     assert np.isnan(alone.ap["Pedestrian"]).all()
+
+
+def test_gains_over_the_lidar_alone_have_intervals(rows):
+    alone, matching = rows[MODULES, "none: LiDAR alone"], rows[MODULES, "matching"]
+    assert alone.gain["Car"] == Interval(0.0, 0.0, 0.0)
+    gain = matching.gain["Car"]
+    assert gain.value == pytest.approx(matching.ap["Car"][1] - alone.ap["Car"][1])
+    assert 0 < gain.low < gain.value < gain.high
+    table = ablation_table(list(rows.values()), SimpleNamespace(heading="AP", columns=("easy",)), 30, False)
+    (row,) = (cells for cells in table.rows if cells is not None and cells[0] == "  matching")
+    assert f"{gain.value:+.1f} [{gain.low:+.1f}, {gain.high:+.1f}]" in row[1]
+    assert any("intervals" in note for note in table.notes)
+
+
+def test_intervals_are_refused_where_there_are_none():
+    with pytest.raises(ConfigError, match="KITTI's evaluation only"):
+        ablate([], SimpleNamespace(), CONFIG, samples=10)
 
 
 def test_policies_differ_in_what_they_keep(rows):

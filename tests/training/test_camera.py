@@ -84,6 +84,18 @@ def test_without_masks() -> None:
     assert set(task(plain).loss(task(plain).network().train(), batch)) == {"score", "box"}
 
 
+def test_a_network_without_masks_begins_with_one_that_has_them(tmp_path: Path) -> None:
+    train(task(), settings(steps=2), tmp_path / "masks")
+    plain = SmallConfig(channels=(4, 4, 8, 8, 8), depths=(0, 0, 0, 0), neck=8, prototypes=0)
+    nothing = settings(steps=1, learning_rate=1e-12, average=0.0, checkpoint_every=1)
+    begun = train(task(plain), nothing, tmp_path / "plain", start=tmp_path / "masks" / "last.pt")
+    before = read_training(tmp_path / "masks" / "last.pt")["averaged"]
+    torch.testing.assert_close(begun.predict.weight, before["predict.weight"][:7])
+    torch.testing.assert_close(begun.state_dict()["tower.0.0.weight"], before["tower.0.0.weight"])
+    with pytest.raises(DetectorError, match="another architecture"):
+        train(task(), nothing, tmp_path / "again", start=tmp_path / "plain" / "last.pt")
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [

@@ -41,7 +41,9 @@ def test_the_command_writes_a_network_that_runs(samples, tmp_path):
     lidar(**options, held_out=1, steps=1, batch_size=2)
     detector = OnnxLidarDetector(tmp_path / "out" / "lidar.onnx", nms="off", score_threshold=0.0, threads=1)
     assert len(detector(scene(0).points)) > 0
-    assert set(json.loads((tmp_path / "out" / "figures.json").read_text())) == {f"AP {name}" for name in KITTI_CLASSES}
+    # what is behind the sensor is out of the network's range
+    there = {KITTI_CLASSES[k] for k in scene(2).labels[scene(2).boxes[:, 0] > 0]}
+    assert set(json.loads((tmp_path / "out" / "figures.json").read_text())) == {f"AP {name}" for name in there}
     with pytest.raises(ConfigError, match="holds a training already"):
         lidar(**options, held_out=1, steps=1, batch_size=2)
     with pytest.raises(ConfigError, match="too few to hold out"):

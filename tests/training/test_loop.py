@@ -11,14 +11,20 @@ from lcf3d.errors import ConfigError, DetectorError
 
 torch = pytest.importorskip("torch")
 
-from lcf3d.training.loop import LAST, TrainingSettings, train  # noqa: E402
+from lcf3d.training.loop import LAST, TrainingSettings, on_device, train  # noqa: E402
 
 
 class Line:
     """y = 2 x - 1 by a small network with dropout and batch normalization."""
 
-    def __init__(self, hidden=8, spoilt_step=None):
-        self.hidden, self.spoilt_step = hidden, spoilt_step
+    def __init__(self, hidden=8, spoilt_step=None, batch_size=16):
+        self.hidden, self.spoilt_step, self.batch_size = hidden, spoilt_step, batch_size
+
+    def described(self):
+        return {"batch_size": self.batch_size, "data": ("a", "b")}
+
+    def starting(self, weights):
+        return weights
 
     def network(self):
         return torch.nn.Sequential(
@@ -27,7 +33,7 @@ class Line:
         )  # fmt: skip
 
     def batch(self, step, rng):
-        x = rng.normal(size=(16, 1)).astype(np.float32)
+        x = rng.normal(size=(self.batch_size, 1)).astype(np.float32)
         if step == self.spoilt_step:
             x[0] = np.nan
         return {"x": torch.from_numpy(x), "y": torch.from_numpy(2 * x - 1)}
@@ -100,6 +106,36 @@ def test_a_folder_in_use_other_settings_and_other_networks_are_refused(tmp_path)
         train(Line(), SETTINGS, tmp_path, resume=True)
 
 
+def test_a_training_goes_on_with_what_it_began_with_but_for_the_workers(tmp_path):
+    with pytest.raises(Stop):
+        train(Line(), SETTINGS, tmp_path, report=stop_at(25))
+    with pytest.raises(ConfigError, match="batch_size 16 then and 8 now"):
+        train(Line(batch_size=8), SETTINGS, tmp_path, resume=True)
+    other = TrainingSettings(**{**vars(SETTINGS), "workers": 1})
+    assert same(train(Line(), SETTINGS, tmp_path / "whole"), train(Line(), other, tmp_path, resume=True))
+
+
+def test_checkpoints_that_tell_nothing_of_their_batches_are_gone_on_with(tmp_path):
+    train(Line(), SETTINGS, tmp_path)
+    state = torch.load(tmp_path / LAST, weights_only=True)
+    del state["task"]
+    torch.save(state, tmp_path / LAST)
+    train(Line(batch_size=8), SETTINGS, tmp_path, resume=True)
+
+
+def test_a_device_that_is_not_there_is_one_sentence(tmp_path):
+    for device in ("no such device", "meta"):
+        with pytest.raises(ConfigError, match=f"torch cannot use the device '{device}'"):
+            train(Line(), SETTINGS, tmp_path / "x", device=device)
+    assert not (tmp_path / "x").exists()
+
+
+def test_batches_are_put_on_a_device_whatever_holds_them():
+    batch = on_device({"a": [torch.zeros(2), 3], "b": (torch.ones(1),)}, "meta")
+    assert batch["a"][0].device.type == batch["b"][0].device.type == "meta"
+    assert batch["a"][1] == 3
+
+
 def test_a_training_begins_with_the_weights_of_another(tmp_path):
     first = train(Line(), SETTINGS, tmp_path / "first")
     nothing = TrainingSettings(1, 1e-12, average=0.0, checkpoint_every=1)
@@ -144,7 +180,8 @@ def test_two_processes_train_one_network(tmp_path):
     )
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", str(script)]
     root = Path(__file__).parents[2]
-    subprocess.run([*command, str(tmp_path)], check=True, cwd=root, env={**os.environ, "PYTHONPATH": str(root)})
+    path = os.pathsep.join([str(root / "src"), str(root)])
+    subprocess.run([*command, str(tmp_path)], check=True, cwd=root, env={**os.environ, "PYTHONPATH": path})
     one, two = (torch.load(tmp_path / f"rank{rank}.pt", weights_only=True) for rank in (0, 1))
     assert torch.allclose(one["weights"], two["weights"])
     assert not torch.allclose(one["seen"], two["seen"]), "each has batches of its own"

@@ -31,6 +31,9 @@ def ablate(
     localizer: Annotated[str, typer.Option(help="for recovery, as for lcf3d run")] = "geometric",
     tiles: Annotated[int, typer.Option(min=1, help="overlapping tiles across wide images, for onnx: detectors")] = 1,
     missing: Annotated[str, typer.Option(help="results that are not there: error, or empty")] = "error",
+    samples: Annotated[
+        int, typer.Option(min=0, help="KITTI: draws of the frames for intervals of the gain over the LiDAR alone")
+    ] = 0,
     json_: Annotated[bool, typer.Option("--json", help="print the rows as JSON")] = False,
 ) -> None:
     """Measure the fusion with parts of it switched off or exchanged.
@@ -68,7 +71,7 @@ def ablate(
     inputs = detections_of(found)
     scores = find_calibration(calibration, found.dataset, found.frame_ids, found.lidar, found.cameras, found.config)
     progress, suppress = plain if json_ else tracked, isinstance(found.lidar, LidarOnScans)
-    rows = measure(inputs, evaluation, found.config, scores, found.localizer, progress, suppress)
+    rows = measure(inputs, evaluation, found.config, scores, found.localizer, progress, suppress, samples)
     scans = all(item.frame.points is not None for item in inputs)
     if json_:
         typer.echo(json.dumps({"frames": len(inputs), "scans": scans, "rows": [r.to_json() for r in rows]}, indent=2))
@@ -100,6 +103,7 @@ def ablation_table(rows: Sequence[AblationRow], evaluation: Evaluation, frames: 
 
     names = [name for name in rows[0].ap if any(row.ap[name][0] == row.ap[name][0] for row in rows)]
     wide = len(names) > 4
+    titles = ("", *names) if wide else tuple(names)
     cells: list[tuple[str, ...] | None] = []
     group = ""
     for row in rows:
@@ -110,11 +114,20 @@ def ablation_table(rows: Sequence[AblationRow], evaluation: Evaluation, frames: 
         if wide:
             known = [row.ap[name][0] for name in names if row.ap[name][0] == row.ap[name][0]]
             values = [f"{sum(known) / max(len(known), 1):.2f}", *values]
+        values = [_with_gain(value, row, name) for value, name in zip(values, titles, strict=True)]
         cells.append((f"  {row.name}", *values, str(row.matched), str(row.recovered), str(row.kept)))
     columns = ("mean", *(_short(name) for name in names)) if wide else tuple(names)
-    notes = () if scans else ("not every frame has a LiDAR scan: rows with detection recovery are left out",)
+    notes = [] if scans else ["not every frame has a LiDAR scan: rows with detection recovery are left out"]
+    if any(row.gain for row in rows):
+        notes.append("below: moderate AP less that of the LiDAR alone, with 95 % intervals over frames drawn again")
     title = f"{evaluation.heading}, {' '.join(evaluation.columns)}, on {frames} frames"
-    return TableData(title, ("variant", *columns, "mat-\nched", "reco-\nvered", "kept"), cells, notes)
+    return TableData(title, ("variant", *columns, "mat-\nched", "reco-\nvered", "kept"), cells, tuple(notes))
+
+
+def _with_gain(value: str, row: AblationRow, name: str) -> str:
+    """A class's figures, and below them the gain over the LiDAR branch alone with its interval, if there is one."""
+    gain = row.gain.get(name)
+    return value if gain is None else f"{value}\n{gain.value:+.1f} [{gain.low:+.1f}, {gain.high:+.1f}]"
 
 
 def _short(name: str) -> str:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from lcf3d.errors import ConfigError
+
 if TYPE_CHECKING:
     from lcf3d.training.loop import TrainingSettings, TrainingTask
     from lcf3d.training.samples import SampleRecipe
@@ -28,8 +30,25 @@ def prepare_samples(recipe: SampleRecipe, root: Path, jobs: int) -> list[Path]:
         return write_samples(recipe, root / recipe.folder, jobs, lambda n: bar.advance(task, n))
 
 
+def held_out_of(count: int, asked: int | None, usual: int) -> int:
+    """How many samples at the end to hold out: those asked for, else the usual number, a fifth of fewer.
+
+    Raises:
+        ConfigError: nothing would be left to learn from.
+    """
+    held_out = min(usual, max(1, count // 5)) if asked is None else asked
+    if count <= held_out:
+        raise ConfigError(f"there are {count} samples, too few to hold out {held_out}; lower --held-out")
+    return held_out
+
+
 def train_with_progress(
-    task: TrainingTask, settings: TrainingSettings, out: Path, resume: bool, start: Path | None = None
+    task: TrainingTask,
+    settings: TrainingSettings,
+    out: Path,
+    resume: bool,
+    start: Path | None = None,
+    device: str = "cpu",
 ) -> Any:
     """`lcf3d.training.loop.train` under a progress bar that shows loss and the last validation; gives the network.
 
@@ -64,4 +83,4 @@ def train_with_progress(
                 figures = "  ".join(f"{name} {value:.3f}" for name, value in progress.validation.items())
                 console.print(f"step {progress.step}: loss {smooth:.3f}  {figures}", soft_wrap=True)
 
-        return train(task, settings, out, resume, report, start)
+        return train(task, settings, out, resume, report, start, device)

@@ -11,6 +11,7 @@ import typer
 if TYPE_CHECKING:
     from lcf3d.training.lidar import LidarTask
     from lcf3d.training.lidar_scans import ScanSource
+    from lcf3d.training.samples import SampleRecipe
 
 VALIDATED = 24
 """Held-out scans that are looked at after each checkpoint; all of them at the end."""
@@ -25,12 +26,15 @@ def lidar(
         str | None, typer.Option(help="file of ROOT/ImageSets, or nuScenes split; all if left out")
     ] = None,
     version: Annotated[str | None, typer.Option(help="folder of nuScenes tables; the only one if left out")] = None,
-    preset: Annotated[str, typer.Option(help="sensor that is simulated")] = "kitti64",
+    preset: Annotated[str, typer.Option(help="sensor and world that are simulated")] = "kitti64",
+    density: Annotated[float, typer.Option(min=0.1, help="factor on the number of simulated road users")] = 1.0,
     frames: Annotated[int, typer.Option(min=2, help="simulated scans")] = 1000,
     samples_seed: Annotated[int, typer.Option(min=0, help="of the simulated scans")] = 1001,
     samples: Annotated[Path | None, typer.Option(help="folder of simulated scans; default: the user's cache")] = None,
     jobs: Annotated[int, typer.Option(min=1, help="processes that simulate")] = 1,
-    held_out: Annotated[int, typer.Option(min=1, help="scans at the end to measure with")] = 100,
+    held_out: Annotated[
+        int | None, typer.Option(min=1, help="scans at the end to measure with; 100, or a fifth of few, if left out")
+    ] = None,
     steps: Annotated[int, typer.Option(min=1)] = 3600,
     batch_size: Annotated[int, typer.Option(min=1, help="windows a step, 36 m x 38 m each, two of a scan")] = 4,
     learning_rate: Annotated[float, typer.Option(help="highest one of the schedule")] = 3e-3,
@@ -42,6 +46,7 @@ def lidar(
     checkpoint_every: Annotated[int, typer.Option(min=1, help="steps between checkpoints and validations")] = 500,
     workers: Annotated[int, typer.Option(min=0, help="processes that prepare batches")] = 0,
     threads: Annotated[int, typer.Option(min=0, help="threads of torch; 0 leaves it to torch")] = 0,
+    device: Annotated[str, typer.Option(help="torch's name of the device to train on")] = "cpu",
     resume: Annotated[bool, typer.Option("--resume", help="go on from the folder's last checkpoint")] = False,
 ) -> None:
     """Train the small LiDAR detector (Car, Pedestrian, Cyclist) and write it as lidar.onnx.
@@ -52,17 +57,20 @@ def lidar(
 
     lcf3d train lidar kitti:KITTI --split train --init train-lidar/last.pt --out train-lidar-kitti
     """
-    from lcf3d.cli.train_common import train_with_progress
+    from lcf3d.cli.train_common import held_out_of, train_with_progress
     from lcf3d.detectors.lidar.presets import COMPACT_KITTI
     from lcf3d.training.lidar import LidarTask, objects_of
     from lcf3d.training.lidar_augmentation import AugmentationSettings
-    from lcf3d.training.loop import TrainingSettings, import_torch
+    from lcf3d.training.loop import TrainingSettings, import_torch, require_device
+    from lcf3d.training.samples import SampleRecipe
 
     torch = import_torch()
+    require_device(device)
     if threads:
         torch.set_num_threads(threads)
-    scans = _scans(dataset, split, version, preset, frames, samples_seed, samples, jobs)
-    learned, measured = scans.hold_out(held_out)
+    recipe = SampleRecipe("lidar", preset, frames, samples_seed, density=density)
+    scans = _scans(dataset, split, version, recipe, samples, jobs)
+    learned, measured = scans.hold_out(held_out_of(scans.count, held_out, 100))
     objects = objects_of(learned, COMPACT_KITTI)
     task = LidarTask(
         learned,
@@ -70,12 +78,12 @@ def lidar(
         batch_size=batch_size,
         augmentation=AugmentationSettings(tilt=math.radians(tilt)),
         objects=objects,
-        start=init,
+        data=f"{dataset} {split or ''} {version or ''}".strip() if dataset else recipe.folder,
     )
     settings = TrainingSettings(
         steps, learning_rate, seed=seed, average=0.998, checkpoint_every=checkpoint_every, workers=workers
     )
-    network = train_with_progress(task, settings, out, resume)
+    network = train_with_progress(task, settings, out, resume, init, device)
     _write(LidarTask(learned, measured), network, out)
 
 
@@ -88,19 +96,13 @@ def _write(task: LidarTask, network: Any, out: Path) -> None:
     export_onnx(trained_detector(network, task.config), out / "lidar.onnx")
     figures = task.validate(network)
     write_json(out / "figures.json", figures)
-    for name, value in figures.items():
-        typer.echo(f"{name:<20}{value:>9.3f}")
+    for name in (f"AP {name}" for name in task.config.class_names):
+        # a class that no held-out scan has, has no AP
+        typer.echo(f"{name:<20}{figures[name]:>9.3f}" if name in figures else f"{name:<20}{'-':>9}")
 
 
 def _scans(
-    dataset: str,
-    split: str | None,
-    version: str | None,
-    preset: str,
-    frames: int,
-    samples_seed: int,
-    samples: Path | None,
-    jobs: int,
+    dataset: str, split: str | None, version: str | None, recipe: SampleRecipe, samples: Path | None, jobs: int
 ) -> ScanSource:
     from lcf3d.structures import KITTI_CLASSES
     from lcf3d.training.lidar_scans import dataset_scans, simulated_scans
@@ -109,7 +111,5 @@ def _scans(
         return dataset_scans(dataset, split, KITTI_CLASSES, version)
     from lcf3d.cli.train_common import prepare_samples
     from lcf3d.training.recipes import default_samples_root
-    from lcf3d.training.samples import SampleRecipe
 
-    recipe = SampleRecipe("lidar", preset, frames, samples_seed)
     return simulated_scans(prepare_samples(recipe, samples or default_samples_root(), jobs), KITTI_CLASSES)

@@ -34,6 +34,7 @@ def localizer(
     init: Annotated[
         Path | None, typer.Option(help="last.pt of another training, whose weights this one begins with")
     ] = None,
+    device: Annotated[str, typer.Option(help="torch's name of the device to train on")] = "cpu",
     resume: Annotated[bool, typer.Option("--resume", help="go on with a training that was interrupted")] = False,
 ) -> None:
     """Train a frustum localizer; without DATA on simulated scans, which rebuilds the network that is shipped.
@@ -49,8 +50,10 @@ def localizer(
     from lcf3d.cli.train_common import train_with_progress
     from lcf3d.localizers.spec import LocalizerSpec
     from lcf3d.training.localizer import LocalizerTask
+    from lcf3d.training.loop import require_device
     from lcf3d.training.recipes import VARIANTS, recipe_of
 
+    require_device(device)
     recipe = recipe_of(classes)
     if variant not in VARIANTS:
         raise ConfigError(f"--variant takes {', '.join(VARIANTS)}, got {variant!r}")
@@ -60,8 +63,10 @@ def localizer(
     given: dict[str, Any] = {"steps": steps, "learning_rate": learning_rate, "seed": seed}
     settings = replace(recipe.settings, **{name: value for name, value in given.items() if value is not None})
     pool, held_out = _pools(recipe, spec, data, split, val_split, samples, jobs)
-    task = LocalizerTask(spec, pool, held_out, batch_size or recipe.batch_size, VARIANTS[variant], recipe.shares)
-    network = train_with_progress(task, settings, out, resume, init)
+    source = f"{data} {split or ''}".strip() if data else recipe.samples.folder
+    size = batch_size or recipe.batch_size
+    task = LocalizerTask(spec, pool, held_out, size, VARIANTS[variant], recipe.shares, data=source)
+    network = train_with_progress(task, settings, out, resume, init, device)
     path = _save(network, spec, out)
     typer.echo(f"{path}: use it with lcf3d run --localizer {'onnx' if form == 'v1' else 'frustum-pointnet'}:{path}")
 

@@ -24,6 +24,7 @@ from lcf3d.errors import FormatError
 from lcf3d.structures import Camera, FloatArray, IntArray
 
 DRIVE = Path(__file__).parents[1] / "demo" / "data" / "drive.zip"
+BEAM_JUMP_RAD = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,6 +159,21 @@ def decode_points(data: bytes) -> NDArray[np.float32]:
     total = np.cumsum(steps, axis=0, dtype=np.uint16)
     total[:, 3] &= 255  # intensity has one byte only
     return (total.view(np.int16) / np.float32(100)).astype(np.float32)
+
+
+def beam_numbers(points: NDArray[np.float32]) -> IntArray:
+    """(N,) beam of each point of a drive's scan, 0 the highest.
+
+    Scans are kept beam after beam, each from left to right; where the azimuth jumps back to the left, a beam begins.
+    """
+    azimuth = np.arctan2(points[:, 1], points[:, 0])
+    begins = np.diff(azimuth, prepend=azimuth[:1]) > BEAM_JUMP_RAD
+    return np.cumsum(begins).astype(np.int64)
+
+
+def every_beam(points: NDArray[np.float32], step: int) -> NDArray[np.float32]:
+    """What a LiDAR with one in ``step`` of the beams sees of the same street: the points of those beams."""
+    return points if step == 1 else points[beam_numbers(points) % step == 0]
 
 
 def _add(archive: zipfile.ZipFile, name: str, data: bytes) -> None:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from lcf3d.errors import ConfigError
+from lcf3d.evaluation.bootstrap import Interval
 from lcf3d.evaluation.protocol import Evaluation
 from lcf3d.fusion.calibration import Calibration
 from lcf3d.fusion.clustering import cluster_boxes
@@ -53,6 +55,7 @@ class AblationRow:
         matched: output boxes that a camera detection confirms.
         recovered: output boxes found from camera detections alone.
         kept: output boxes of the LiDAR branch that nothing confirms.
+        gain: by class, how much better than the LiDAR branch alone, with bootstrap intervals, if asked for.
     """
 
     group: str
@@ -61,11 +64,14 @@ class AblationRow:
     matched: int = 0
     recovered: int = 0
     kept: int = 0
+    gain: dict[str, Interval] = field(default_factory=dict)
 
     def to_json(self) -> dict[str, Any]:
         """Plain JSON values, None for NaN."""
         values = asdict(self)
         values["ap"] = {name: [None if np.isnan(v) else v for v in ap] for name, ap in self.ap.items()}
+        if not self.gain:
+            del values["gain"]
         return values
 
 
@@ -119,6 +125,7 @@ def ablate(
     localizer: Localizer | None = None,
     progress: Progress = lambda indices: indices,
     suppress: bool = False,
+    samples: int = 0,
 ) -> list[AblationRow]:
     """Measure all variants on frames of any dataset.
 
@@ -130,13 +137,19 @@ def ablate(
         localizer: for recovery, see `LateCascadeFusion`.
         progress: wraps the loop over variants, for a progress bar.
         suppress: the LiDAR detections are without non-maximum suppression: LiDAR alone is measured after it.
+        samples: draws of the frames for intervals of the gain over the LiDAR branch alone; 0 for none.
+
+    Raises:
+        ConfigError: intervals are asked of an evaluation that has none.
     """
+    if samples and not hasattr(evaluation, "differences"):
+        raise ConfigError("bootstrap intervals of ablations are there for KITTI's evaluation only; leave --samples out")
     scans = all(item.frame.points is not None for item in inputs)
     masks = any(seen.masks is not None for item in inputs for seen in item.camera.values())
     chosen = variants(config, scans, masks)
     alone = [suppressed(item.lidar) for item in inputs] if suppress else [item.lidar for item in inputs]
     numbers = progress(range(len(chosen)))
-    return [_measure(inputs, alone, evaluation, chosen[i], config, calibration, localizer) for i in numbers]
+    return [_measure(inputs, alone, evaluation, chosen[i], config, calibration, localizer, samples) for i in numbers]
 
 
 def suppressed(lidar: Detections3D) -> Detections3D:
@@ -152,6 +165,7 @@ def _measure(
     config: FusionConfig,
     calibration: Calibration | None,
     localizer: Localizer | None,
+    samples: int,
 ) -> AblationRow:
     outcomes = np.zeros(len(Outcome), dtype=np.int64)
     results = []
@@ -165,10 +179,10 @@ def _measure(
             outcomes += np.bincount(fused.outcomes, minlength=len(Outcome))
         results.append(detections)
     figures = evaluation.figures(results)
+    # not part of the protocol: see `ablate`
+    differences = getattr(evaluation, "differences", None)
+    gain = differences(alone, results, samples) if samples and differences else {}
     unknown = (float("nan"),) * len(evaluation.columns)
-    return AblationRow(
-        variant.group,
-        variant.name,
-        {name: figures.get(name, unknown) for name in config.class_names},
-        *(int(outcomes[s]) for s in (Outcome.MATCHED, Outcome.RECOVERED, Outcome.KEPT)),
-    )
+    matched, recovered, kept = (int(outcomes[s]) for s in (Outcome.MATCHED, Outcome.RECOVERED, Outcome.KEPT))
+    ap = {name: figures.get(name, unknown) for name in config.class_names}
+    return AblationRow(variant.group, variant.name, ap, matched, recovered, kept, gain)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
 from lcf3d.datasets.base import CameraSource, Dataset, LidarSource
@@ -10,6 +13,14 @@ from lcf3d.detectors.base import CameraDetector, FrameDetector, LidarDetector, c
 from lcf3d.detectors.lidar.sweeps import cloud_of, missing_of
 from lcf3d.detectors.named import load_detector
 from lcf3d.structures import Detections2D, Detections3D, Frame
+
+log = logging.getLogger(__name__)
+
+MODELS = Path(__file__).parents[1] / "models"
+SIMULATED = "simulation.json"
+"""The file that `lcf3d simulate` leaves in the folder of a data set."""
+ON_REAL_DATA = "On real data:"
+"""How the line of a model card begins that says what its network is worth there."""
 
 
 class LidarOnScans:
@@ -77,6 +88,7 @@ def open_lidar(text: str, dataset: Dataset, class_names: Sequence[str], missing:
     Raises:
         Lcf3dError: there is no such detector, or it cannot be loaded.
     """
+    _warn_of_real_data(text, "lidar", dataset)
     loaded: Any = load_detector(text, "lidar", class_names, {"missing": missing}, dataset)
     if hasattr(loaded, "detect_frame"):
         return DetectorOnFrames(loaded)
@@ -102,6 +114,28 @@ def open_cameras(
     by_text: dict[str, CameraSource] = {}
     for text in texts.values():
         if text not in by_text:
+            _warn_of_real_data(text, "camera", dataset)
             loaded: Any = load_detector(text, "camera", class_names, defaults, dataset)
             by_text[text] = loaded if hasattr(loaded, "detect") else CameraOnImages(loaded)
     return {name: by_text[text] for name, text in texts.items()}
+
+
+def _warn_of_real_data(text: str, sensor: str, dataset: Dataset) -> None:
+    """Say once what a network costs that has seen simulation only, if the dataset is not a simulated one."""
+    kind, _, rest = text.partition(":")
+    root = getattr(dataset, "root", None)
+    if kind == "shipped" and not (root is not None and (Path(root) / SIMULATED).is_file()):
+        _warn_once(sensor, rest.partition("?")[0])
+
+
+@lru_cache(maxsize=16)
+def _warn_once(sensor: str, name: str) -> None:
+    card = MODELS / f"{sensor}_{name}.md"
+    figures = real_data_note(card.read_text(encoding="utf-8")) if card.is_file() else ""
+    if figures:
+        log.warning("the %s network shipped:%s has seen simulation only. %s", sensor, name, figures)
+
+
+def real_data_note(card: str) -> str:
+    """The line of a model card that begins with `ON_REAL_DATA`; empty if there is none."""
+    return next((line.strip() for line in card.splitlines() if line.startswith(ON_REAL_DATA)), "")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 INPUT_SIZE = (256, 832)
 """(height, width) of the network's input: KITTI's proportions at two thirds of its resolution."""
 COARSEST = 32
+MASK_PARTS = ("fine", "coarse", "prototype")
+"""Parts of `SmallDetector` that a network without masks lacks."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +40,7 @@ class CameraTask:
         batch_size: views a step.
         view: (height, width) of the views, multiples of 32.
         augmentation: how views are drawn.
+        data: what the images are, in words.
     """
 
     images: Sequence[LabelledImage]
@@ -46,6 +49,7 @@ class CameraTask:
     batch_size: int = 8
     view: tuple[int, int] = (192, 416)
     augmentation: Augmentation = field(default_factory=Augmentation)
+    data: str = ""
 
     def __post_init__(self) -> None:
         if not self.images:
@@ -64,6 +68,20 @@ class CameraTask:
 
         network: SmallDetector = SmallDetector(self.config).to(memory_format=import_torch().channels_last)
         return network
+
+    def described(self) -> dict[str, Any]:
+        """What batches depend on, as plain data."""
+        told = {"data": self.data, "images": len(self.images), "held_out": len(self.held_out)}
+        network = {"prototypes": self.config.prototypes}
+        return {**told, **network, "batch_size": self.batch_size, "view": self.view, **asdict(self.augmentation)}
+
+    def starting(self, weights: dict[str, Any]) -> dict[str, Any]:
+        """Weights to begin with; those of a network with masks serve one without, but for what makes its masks."""
+        if self.config.prototypes:
+            return weights
+        outputs = 4 + self.config.classes
+        kept = {name: value for name, value in weights.items() if name.partition(".")[0] not in MASK_PARTS}
+        return {name: value[:outputs] if name.startswith("predict.") else value for name, value in kept.items()}
 
     def batch(self, step: int, rng: np.random.Generator) -> dict[str, Any]:
         """Views of random images: uint8 pixels and the objects of all views one after the other."""

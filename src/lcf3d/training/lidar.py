@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -45,7 +45,7 @@ class LidarTask:
         augmentation: how far scans are changed.
         objects: to be pasted into scans; see `objects_of`.
         box_weight: weight of the box terms beside that of the heat.
-        start: checkpoint of an earlier training whose averaged weights are begun with; random ones without it.
+        data: what the scans are, in words.
     """
 
     scans: ScanSource
@@ -57,20 +57,23 @@ class LidarTask:
     augmentation: AugmentationSettings = field(default_factory=AugmentationSettings)
     objects: ObjectDatabase | None = None
     box_weight: float = 2.0
-    start: Path | None = None
+    data: str = ""
 
     def network(self) -> Any:
-        """The network with random weights, or with those of ``start``.
-
-        Raises:
-            DetectorError: ``start`` is no checkpoint, or of another architecture.
-        """
+        """The network with random weights."""
         from lcf3d.detectors.lidar.compact import CompactPillars
 
-        network = CompactPillars.build(self.config)
-        if self.start is not None:
-            load_parameters(network, read_training(self.start)["averaged"], str(self.start))
-        return network
+        return CompactPillars.build(self.config)
+
+    def described(self) -> dict[str, Any]:
+        """What batches depend on, as plain data."""
+        told = {"data": self.data, "scans": self.scans.count, "network": self.config.name}
+        batch = {"batch_size": self.batch_size, "window": self.window, "windows_a_scan": self.windows_a_scan}
+        return {**told, **batch, "box_weight": self.box_weight, **asdict(self.augmentation)}
+
+    def starting(self, weights: dict[str, Any]) -> dict[str, Any]:
+        """Weights to begin with, as they are."""
+        return weights
 
     def batch(self, step: int, rng: np.random.Generator) -> dict[str, Any]:
         """Tensors of a step; see `center_losses` and `lcf3d.detectors.lidar.compact.CompactNetwork`."""
@@ -89,7 +92,7 @@ class LidarTask:
         return center_losses(maps[0], batch, self.box_weight)
 
     def validate(self, network: Any) -> dict[str, float]:
-        """Centre-distance AP of each class on the held-out scans, cut to the network's range."""
+        """Centre-distance AP of each class that the held-out scans have, cut to the network's range."""
         if self.held_out is None:
             return {}
         from lcf3d.detectors.lidar.compact import CompactPillars
@@ -101,8 +104,9 @@ class LidarTask:
             truths.append(_truth(scan, self.config.class_names))
             found.append(_without_ignored(detector(scan.points), scan))
         metrics = evaluate_generalization(truths, found, class_names=self.config.class_names)
-        rows = zip(metrics.class_names, metrics.aps.mean(axis=1), strict=True)
-        return {f"AP {name}": float(ap) for name, ap in rows}
+        there = {k for truth in truths for k in truth.labels.tolist()}
+        rows = enumerate(zip(metrics.class_names, metrics.aps.mean(axis=1), strict=True))
+        return {f"AP {name}": float(ap) for k, (name, ap) in rows if k in there}
 
 
 def collate(windows: Sequence[tuple[LabelledScan, VoxelSpec]], config: LidarConfig) -> dict[str, Any]:

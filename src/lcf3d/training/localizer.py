@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -49,6 +49,7 @@ class LocalizerTask:
         augmentation: of the training frustums.
         shares: share of each class in the batches, by name; those left out are drawn as often as they occur.
         weights: of the losses.
+        data: what the frustums are from, in words.
 
     Raises:
         ConfigError: a batch of fewer than two frustums, or shares of unknown classes.
@@ -63,6 +64,7 @@ class LocalizerTask:
         augmentation: Augmentation | None = None,
         shares: Mapping[str, float] | None = None,
         weights: LossWeights | None = None,
+        data: str = "",
     ) -> None:
         if batch_size < 2:
             raise ConfigError(f"a batch needs two frustums or more for its statistics, got {batch_size}")
@@ -72,11 +74,21 @@ class LocalizerTask:
         self.spec, self.pool, self.validation, self.batch_size = spec, pool, validation, batch_size
         self.augmentation = augmentation or Augmentation()
         self.weights = weights or LossWeights()
+        self.data, self.shares = data, dict(shares or {})
         self._chances = _chances(labels_of(pool), spec.class_names, shares or {})
 
     def network(self) -> Any:
         """The network with random weights."""
         return build_network(self.spec)
+
+    def described(self) -> dict[str, Any]:
+        """What batches depend on, as plain data."""
+        told = {"data": self.data, "frustums": len(self.pool), "classes": self.spec.class_names, "form": self.spec.form}
+        return {**told, "batch_size": self.batch_size, "shares": self.shares, **asdict(self.augmentation)}
+
+    def starting(self, weights: dict[str, Any]) -> dict[str, Any]:
+        """Weights to begin with, as they are."""
+        return weights
 
     def batch(self, step: int, rng: np.random.Generator) -> dict[str, Any]:
         """Arrays of `lcf3d.training.frustum_batch.assemble` as tensors."""

@@ -6,9 +6,11 @@ and resumed ends with the same weights as one that was not.
 
 from __future__ import annotations
 
+import copy
+import json
 import math
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -80,7 +82,15 @@ class TrainingTask(Protocol):
         ...
 
     def validate(self, network: Any) -> dict[str, float]:
-        """Figures of the network (in evaluation mode) on held-out samples; may be empty."""
+        """Figures of the network (in evaluation mode, on the CPU) on held-out samples; may be empty."""
+        ...
+
+    def described(self) -> dict[str, Any]:
+        """What the batches depend on besides the settings, as plain data: a training is resumed with the same only."""
+        ...
+
+    def starting(self, weights: dict[str, Any]) -> dict[str, Any]:
+        """The weights of another training as this one's network takes them."""
         ...
 
 
@@ -108,8 +118,9 @@ def train(
     resume: bool = False,
     report: Callable[[Progress], None] = lambda _: None,
     start: Path | None = None,
+    device: str = "cpu",
 ) -> Any:
-    """Train a network; gives it with the averaged weights, in evaluation mode.
+    """Train a network; gives it with the averaged weights, in evaluation mode, on the CPU.
 
     ``folder`` receives ``last.pt`` (everything to go on from), ``settings.json``, ``metrics.json`` and TensorBoard's
     event files. Under torchrun every process works on its own batches and gradients are averaged.
@@ -121,15 +132,16 @@ def train(
         resume: go on from the folder's checkpoint, if there is one.
         report: called after every step.
         start: checkpoint of another training, whose averaged weights this one begins with.
+        device: torch's name of the device to train on.
 
     Raises:
-        ConfigError: the folder holds a training already, or one with other settings.
+        ConfigError: the folder holds a training already, or one with other settings or data; there is no such device.
         DetectorError: the loss is not finite (the last good checkpoint stays), or the checkpoint is another network's.
         MissingExtraError: torch is not installed.
     """
     torch = import_torch()
     with _deterministic(torch):
-        return _train(torch, task, settings, folder, resume, report, start)
+        return _train(torch, task, settings, folder, resume, report, start, require_device(device))
 
 
 def _train(
@@ -140,10 +152,11 @@ def _train(
     resume: bool,
     report: Callable[[Progress], None],
     start: Path | None,
+    device: str,
 ) -> Any:
     """See `train`."""
     rank, world = _join(torch)
-    run = _Run(torch, task, settings, folder, rank)
+    run = _Run(torch, task, settings, folder, rank, device)
     if start is not None:
         run.start(start)
     first = run.resume() if resume else run.begin()
@@ -155,7 +168,7 @@ def _train(
         torch.manual_seed(_seed(settings.seed, step, rank, 1))
         for group in run.optimizer.param_groups:
             group["lr"] = settings.rate(step)
-        terms = task.loss(network, batch)
+        terms = task.loss(network, on_device(batch, device))
         total = sum(terms.values())
         _require_finite(terms, step, folder)
         run.optimizer.zero_grad(set_to_none=True)
@@ -169,7 +182,7 @@ def _train(
             run.network.train()
         report(run.note(done, terms, figures))
     run.close()
-    return run.averaged
+    return run.averaged.cpu()
 
 
 @contextmanager
@@ -186,11 +199,16 @@ def _deterministic(torch: Any) -> Iterator[None]:
 class _Run:
     """The state of a training: network, optimizer, averaged weights, and where they are kept."""
 
-    def __init__(self, torch: Any, task: TrainingTask, settings: TrainingSettings, folder: Path, rank: int) -> None:
+    def __init__(
+        self, torch: Any, task: TrainingTask, settings: TrainingSettings, folder: Path, rank: int, device: str
+    ) -> None:
         self.torch, self.task, self.settings, self.folder, self.rank = torch, task, settings, folder, rank
+        self.device = device
+        # as a file gives it back
+        self.described: dict[str, Any] = json.loads(json.dumps(task.described()))
         torch.manual_seed(settings.seed)
-        self.network = task.network()
-        self.averaged = task.network()
+        self.network = task.network().to(device)
+        self.averaged = task.network().to(device)
         self.averaged.load_state_dict(self.network.state_dict())
         self.averaged.eval().requires_grad_(False)
         decayed = [p for p in self.network.parameters() if p.requires_grad and p.ndim > 1]
@@ -202,7 +220,7 @@ class _Run:
 
     def start(self, path: Path) -> None:
         """Take the averaged weights of another training."""
-        weights = read_training(path)["averaged"]
+        weights = self.task.starting(read_training(path)["averaged"])
         load_parameters(self.network, weights, str(path))
         load_parameters(self.averaged, weights, str(path))
 
@@ -219,8 +237,7 @@ class _Run:
         if not path.exists():
             return self.begin()
         state = read_training(path)
-        if state["settings"] != asdict(self.settings):
-            raise ConfigError(f"{path} was trained with other settings ({state['settings']}); use the same to go on")
+        _require_same(path, {**state["settings"], **state.get("task", {})}, {**asdict(self.settings), **self.described})
         load_parameters(self.network, state["network"], str(path))
         load_parameters(self.averaged, state["averaged"], str(path))
         self.optimizer.load_state_dict(state["optimizer"])
@@ -241,13 +258,15 @@ class _Run:
         """Validate and write the checkpoint, whole or not at all; gives the validation's figures."""
         if self.rank != 0:
             return {}
+        network = self.averaged if self.device == "cpu" else copy.deepcopy(self.averaged).cpu()
         with self.torch.no_grad():
-            figures = self.task.validate(self.averaged)
+            figures = self.task.validate(network)
         self.history.append({"step": done, **figures})
         state = {
             "format": TRAINING_FORMAT,
             "step": done,
             "settings": asdict(self.settings),
+            "task": self.described,
             "network": self.network.state_dict(),
             "averaged": self.averaged.state_dict(),
             "optimizer": self.optimizer.state_dict(),
@@ -291,6 +310,43 @@ def import_torch() -> Any:
     from lcf3d.networks.torch import torch
 
     return torch
+
+
+def require_device(device: str) -> str:
+    """The device, if torch can use it here.
+
+    Raises:
+        ConfigError: it cannot.
+    """
+    torch = import_torch()
+    try:
+        torch.zeros(1, device=device).cpu()
+    except (RuntimeError, AssertionError, NotImplementedError) as error:
+        reason = str(error).splitlines()[0][:120]
+        raise ConfigError(
+            f"torch cannot use the device {device!r} here ({reason}); choose cpu, or one it has"
+        ) from None
+    return device
+
+
+def on_device(batch: Any, device: str) -> Any:
+    """A batch (nested tuples, lists or dicts of tensors) with its tensors on a device."""
+    if isinstance(batch, Mapping):
+        return {name: on_device(value, device) for name, value in batch.items()}
+    if isinstance(batch, (tuple, list)):
+        return type(batch)(on_device(value, device) for value in batch)
+    return batch.to(device) if hasattr(batch, "to") else batch
+
+
+def _require_same(path: Path, then: Mapping[str, Any], now: Mapping[str, Any]) -> None:
+    """See that a training goes on as it began; how many processes prepare its batches changes nothing.
+
+    What a checkpoint of an earlier version does not tell is not compared.
+    """
+    other = [name for name in then if name in now and name != "workers" and then[name] != now[name]]
+    if other:
+        listed = ", ".join(f"{name} {then[name]!r} then and {now[name]!r} now" for name in other)
+        raise ConfigError(f"{path} was trained with other settings: {listed}; use the same to go on")
 
 
 def _seed(*parts: int) -> int:

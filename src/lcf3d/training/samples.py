@@ -61,7 +61,8 @@ class SampleRecipe:
     @property
     def folder(self) -> str:
         """A folder name that tells such sets apart; a longer set begins with the shorter one."""
-        return f"{self.preset}-{self.sensor}-seed{self.seed}"
+        density = "" if self.density == 1 else f"-density{self.density:g}"
+        return f"{self.preset}-{self.sensor}-seed{self.seed}{density}"
 
     def made_by(self) -> dict[str, Any]:
         """What every single sample depends on."""

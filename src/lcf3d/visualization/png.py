@@ -52,10 +52,10 @@ def draw_frame(frame: Frame, scene: Scene, cameras: Sequence[str] | None = None,
     return _stack([_legend(frame.id, scene, width), *rows])
 
 
-def save_png(picture: PIL.Image.Image, path: Path) -> None:
-    """Write a picture as PNG, whole or not at all."""
+def save_png(picture: PIL.Image.Image, path: Path, compression: int = 6) -> None:
+    """Write a picture as PNG, whole or not at all; ``compression`` 0 to 9, 1 is twice as quick as 6."""
     with atomic_path(Path(path)) as temporary:
-        picture.save(temporary, format="PNG")
+        picture.save(temporary, format="PNG", compress_level=compression)
 
 
 def _shown_cameras(frame: Frame, names: Sequence[str] | None) -> list[Camera]:
