@@ -143,6 +143,17 @@ def test_resuming_tables_fuses_what_is_not_there(root: Path, tmp_path: Path) -> 
     assert len(open_run_folder(whole).frame_ids()) == 12
 
 
+def test_tables_made_anew(root: Path, tmp_path: Path) -> None:
+    tables = fused(root, tmp_path / "tables", form="parquet")
+    extra = tables / "provenance" / "part-old.parquet"
+    extra.write_bytes(next((tables / "provenance").iterdir()).read_bytes())
+    fused(root, tables, form="parquet", overwrite=True)
+    assert not extra.exists()
+    assert len(open_run_folder(tables).frame_ids()) == 12
+    with pytest.raises(ConfigError, match="a run of another --format"):
+        fused(root, tables, overwrite=True)
+
+
 def test_tables_of_others_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "part-1.parquet"
     path.write_bytes(b"nothing")

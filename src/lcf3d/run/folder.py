@@ -122,6 +122,8 @@ class RunFolder:
         elif occupied:
             if not inputs.is_file():
                 raise ConfigError(f"{self.path} holds files of something else; choose another --out")
+            if _form(read_json(inputs)) != _form(run):
+                raise ConfigError(f"{self.path} holds a run of another --format; choose another --out")
             for file in self._own_files():
                 file.unlink(missing_ok=True)
         write_json(inputs, run)
@@ -133,7 +135,7 @@ class RunFolder:
         results = [] if self._writer is None else list(self._writer.written())
         own = [file for file in results if file.parent.name != "data" or file.stem in frames]
         own += [*(self.provenance_path(frame_id) for frame_id in frames), self.calibration_path, self.alignment_path]
-        return [file for file in own if not _behind_link(file, self.path)]
+        return [file for file in own if not is_behind_link(file, self.path)]
 
     def frame_ids(self) -> list[str]:
         """Frames that are done, sorted."""
@@ -172,6 +174,11 @@ class RunFolder:
             return FusedDetections.from_json(read_json(path))
 
 
-def _behind_link(file: Path, folder: Path) -> bool:
+def _form(run: Any) -> str:
+    """The form of a run folder, as ``run.json`` has it."""
+    return str(run.get("form", "folder")) if isinstance(run, dict) else "folder"
+
+
+def is_behind_link(file: Path, folder: Path) -> bool:
     """Whether a file, or a folder on the way to it from ``folder``, is a link."""
     return any(path.is_symlink() for path in (file, *file.parents) if path != folder and folder in path.parents)

@@ -18,7 +18,7 @@ from pathlib import Path
 from lcf3d.errors import ConfigError, FormatError
 from lcf3d.formats.fused_table import arrow, read_frame_ids, read_frames, write_detections, write_frames
 from lcf3d.provenance import FusedDetections
-from lcf3d.run.folder import RunFolder
+from lcf3d.run.folder import RunFolder, is_behind_link
 from lcf3d.structures import Frame
 
 FORMS = ("folder", "parquet")
@@ -65,6 +65,10 @@ class TableRunFolder(RunFolder):
         self._pending: list[tuple[str, FusedDetections]] = []
         self._places: dict[str, Path] | None = None
         self._read: tuple[Path, dict[str, FusedDetections]] | None = None
+
+    def _own_files(self) -> list[Path]:
+        own = [*TableWriter(self.path).written(), self.calibration_path, self.alignment_path]
+        return [file for file in own if not is_behind_link(file, self.path)]
 
     def places(self) -> dict[str, Path]:
         """The shard of each frame that is done.
