@@ -110,6 +110,14 @@ class ClocsTask:
         """Nothing: figures are cross-validated."""
         return {}
 
+    def described(self) -> dict[str, Any]:
+        """Which frames of how many candidates."""
+        return {"frames": self.frames.tolist(), "candidates": len(self.sample.frames)}
+
+    def starting(self, weights: dict[str, Any]) -> dict[str, Any]:
+        """As they are: one network of one width."""
+        return weights
+
 
 def collect(study: CalibrationStudy, name: str) -> tuple[ClassSample, ScoreScale]:
     """All candidates of a class, and the scale of their scores.
