@@ -78,7 +78,10 @@ def test_out_writes_the_report_and_its_numbers(
     assert run(monkeypatch, root, root / "half", "--out", root / "report", "--worst", "3") == 0
     assert "report.html" in capsys.readouterr().out
     html = (root / "report" / "report.html").read_text()
-    assert html.count("1 wrong, 1 missed") == 3
+    data = json.loads(html.partition('id="data">')[2].partition("</script>")[0])
+    # the frames with most errors come first
+    assert [(f["runs"][0]["wrong"], f["runs"][0]["missed"]) for f in data["frames"][:3]] == [(1, 1)] * 3
+    assert "Command" in html
     content = json.loads((root / "report" / "metrics.json").read_text())
     assert content["results"][0]["closer_look"]["Car"]["best_f1"]["misses"] == 23
 
