@@ -31,23 +31,12 @@ def test_single_modal_rows_on_kitti(kitti, tmp_path):
         assert rows[name]["frames"] == 1
         assert all(value is not None for value in rows[name]["measured"].values()), rows[name]["notes"]
     # both rows and the pure cascade look at the image once
-    kept = list((tmp_path / "detections").glob("fasterrcnn*/left/*.npz"))
+    kept = list((tmp_path / "detections").glob("*fasterrcnn-r101-kitti*/left/*.npz"))
     assert len(kept) == 1
     written = kept[0].stat().st_mtime_ns
     cascade = paper("table-4", "--kitti", str(kitti), "--out", str(tmp_path), "--row", "recovery")["recovery"]
     assert cascade["measured"]["FPS"] > 0
     assert kept[0].stat().st_mtime_ns == written
-
-
-def test_nuscenes_row(tmp_path):
-    root = tmp_path / "sim"
-    result = CliRunner().invoke(app, ["simulate", str(root), "--frames", "2", "--preset", "nuscenes32"])
-    assert result.exit_code == 0, result.output
-    row = paper("table-3", "--nuscenes", str(root), "--out", str(tmp_path / "out"), "--row", "PointPillars")[
-        "PointPillars"
-    ]
-    assert row["frames"] >= 1
-    assert all(value is not None for value in row["measured"].values()), row["notes"]
 
 
 def test_domain_shift_row(kitti, tmp_path):

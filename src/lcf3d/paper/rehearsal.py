@@ -73,6 +73,10 @@ def _state(name: str) -> dict[str, Any]:
         # gains that keep activations from fading, and few of the many anchors score, but some do
         if isinstance(module, torch.nn.BatchNorm1d | torch.nn.BatchNorm2d) and module.weight is not None:
             torch.nn.init.constant_(module.weight, 2.4)
+        if parameter.endswith("conv_reg") and hasattr(module, "weight"):
+            # boxes as large as their anchors
+            torch.nn.init.zeros_(module.weight)
+            torch.nn.init.zeros_(module.bias)
         if parameter.endswith(("conv_cls", "heatmap.1")) and getattr(module, "bias", None) is not None:
             torch.nn.init.constant_(module.bias, -2.2)
     state = network.state_dict()
