@@ -11,6 +11,10 @@ settings.register_profile("ci", derandomize=True)
 if os.environ.get("CI"):
     settings.load_profile("ci")
 
+# tests run side by side: torch and BLAS must not fight over the cores, and one thread adds in one order
+for variable in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+    os.environ.setdefault(variable, "1")
+
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner, Result
 
+from lcf3d import read_run
 from lcf3d.cli.app import app
 from lcf3d.errors import FormatError, Lcf3dError
 from lcf3d.formats.coco import write_camera_detections
@@ -102,3 +103,25 @@ def test_a_sequence_that_is_not_there(tmp_path: Path) -> None:
     make_tracking(tmp_path)
     with pytest.raises(Lcf3dError, match="has no sequence '9' among its 2"):
         lcf3d("check", f"kitti-tracking:{tmp_path}?sequence=0009")
+
+
+@pytest.mark.parametrize("option", ["--memory", "--smooth"])
+def test_frames_of_a_drive_remember(argoverse: Path, option: str) -> None:
+    branches = "--lidar", f"results:{argoverse / 'lidar.feather'}", "--camera", f"results:{argoverse / 'camera.json'}"
+    run_argoverse(argoverse)
+    alone = list(read_run(argoverse / "out").values())
+    lcf3d("run", f"argoverse2:{argoverse / 'av2'}", *branches, option, "--out", argoverse / "remembering")
+    remembered = list(read_run(argoverse / "remembering").values())
+    assert all(found.tracks is None for found in alone)
+    assert {int(i) for found in remembered for i in found.tracks.ids} == {0}
+    # the camera saw the car in the first frame only: the last one profits from that
+    assert remembered[-1].detections.scores[0] > alone[-1].detections.scores[0]
+
+
+def test_serve_at_its_port(argoverse: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("starlette", reason="needs starlette (extra serve)")
+    ports: list[int] = []
+    monkeypatch.setattr("lcf3d.evaluation.server.serve", lambda app, port: ports.append(port))
+    run_argoverse(argoverse)
+    lcf3d("serve", argoverse / "out", "--port", "8123")
+    assert ports == [8123]

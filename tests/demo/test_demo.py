@@ -94,3 +94,10 @@ def test_a_damaged_package_is_one_sentence(monkeypatch, tmp_path):
     assert result.exit_code != 0
     assert "lcf3d ships no LiDAR network" in str(result.exception)
     assert not (tmp_path / "d").exists()
+
+
+def test_view_opens_an_animation(monkeypatch, tmp_path):
+    opened = []
+    monkeypatch.setattr("typer.launch", opened.append)
+    assert CliRunner().invoke(app, ["demo", "--out", str(tmp_path), "--frames", "2", "--view"]).exit_code == 0
+    assert opened == [str(tmp_path / "16-beams" / "drive.gif")]

@@ -159,3 +159,18 @@ def test_the_list_names_every_table():
     assert result.exit_code == 0
     for name in ("table-1", "table-7", "figure-2", "--nuscenes: "):
         assert name in result.output
+
+
+def test_dry_and_the_device_of_the_networks(tmp_path, drive, monkeypatch):
+    from lcf3d.cli import paper
+
+    root, lidar, _ = drive
+    uses = ["--use", f"pointpillars-kitti=results:{lidar}"]
+    command = ["paper", "table-1", "--kitti", str(root), "--out", str(tmp_path), "--row", "PointPillars", *uses]
+    result = CliRunner().invoke(app, [*command, "--dry", "--json"])
+    assert result.exit_code == 0, result.output
+    assert not list(tmp_path.glob("**/*.npz"))
+    devices = []
+    monkeypatch.setattr(paper, "_measured", lambda table, rows, place: devices.append(place.device) or {})
+    CliRunner().invoke(app, [*command, "--device", "cuda:1", "--json"])
+    assert devices == ["cuda:1"]

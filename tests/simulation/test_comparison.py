@@ -70,7 +70,7 @@ def test_compare_draws_a_figure_and_gives_numbers(tmp_path):
 def test_a_folder_without_scans_and_a_missing_package_are_refused(tmp_path, monkeypatch):
     write_kitti(tmp_path, [[[1, 2, 3, 0]]], [[]])
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-    with pytest.raises(MissingExtraError, match=r"lcf3d\[viz\]"):
+    with pytest.raises(MissingExtraError, match=r"lcf3d\[simulate\]"):
         compare(tmp_path, tmp_path, tmp_path / "figure.png")
     (tmp_path / "training" / "velodyne" / "000000.bin").unlink()
     with pytest.raises(DatasetError, match="holds no scans"):

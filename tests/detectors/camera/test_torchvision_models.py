@@ -239,9 +239,9 @@ def test_checkpoints_that_do_not_fit(mask_file, tmp_path):
     names = ("car", "person", "bicycle")
     first = "backbone.body.layer2.0.conv1.weight"
     changed = save({**state, first: torch.ones(3, 3)})
-    with pytest.raises(DetectorError, match=rf"fit torchvision's maskrcnn_resnet50_fpn.*1 of another shape: {first}"):
+    with pytest.raises(DetectorError, match=rf"maskrcnn_resnet50_fpn.*architecture: 1 of another shape: {first}"):
         TorchvisionDetector("maskrcnn_resnet50_fpn", checkpoint=changed, names=names)
-    with pytest.raises(DetectorError, match=r"fasterrcnn_resnet50_fpn with 3 classes: .*unexpected: roi_heads\.mask"):
+    with pytest.raises(DetectorError, match=r"fasterrcnn_resnet50_fpn with 3 classes .*unexpected: roi_heads\.mask"):
         TorchvisionDetector("fasterrcnn_resnet50_fpn", checkpoint=mask_file, names=names)
     with pytest.raises(DetectorError, match=r"has 3 classes .*name them with names=first"):
         TorchvisionDetector("maskrcnn_resnet50_fpn", checkpoint=mask_file)

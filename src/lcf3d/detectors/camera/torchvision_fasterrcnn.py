@@ -203,7 +203,7 @@ class TorchvisionFasterRCNN:
         self.has_masks = any(name.startswith("roi_head.mask_head.") for name in state)
         with torch.device("meta"):
             network = FasterRCNNNetwork(depth, self.style, self.has_masks)
-        load_parameters(network, state, f"Faster R-CNN with ResNet-{depth} and FPN")
+        load_parameters(network, state, f"the checkpoint for Faster R-CNN with ResNet-{depth} and FPN")
         self.device = torch_device(device)
         self.network = network.eval().requires_grad_(False).to(self.device)
         self.class_names = self.style.classes if class_names is None else tuple(class_names)

@@ -168,7 +168,8 @@ def build_network(name: str, state: Mapping[str, Any], outputs: int, score_thres
             # torchvision's own COCO files of the first networks were trained with nothing added to the variance
             exact = outputs == _COCO_OUTPUTS and name != WITHOUT_WEIGHTS
             _freeze_normalization(network.backbone.body, 0.0 if exact else 1e-5)
-    load_parameters(network, current_names(state), f"torchvision's {name} with {outputs - 1} classes")
+    source = f"the checkpoint for torchvision's {name} with {outputs - 1} classes"
+    load_parameters(network, current_names(state), source)
     # the only tensors that are no parameters: with the rest, they were not given values
     network.rpn.anchor_generator = detection.anchor_utils.AnchorGenerator(
         network.rpn.anchor_generator.sizes, network.rpn.anchor_generator.aspect_ratios
