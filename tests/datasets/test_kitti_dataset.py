@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from lcf3d.datasets.kitti import KittiDataset, read_calibration, read_points
+from lcf3d.datasets.kitti import KittiDataset, read_points
+from lcf3d.datasets.kitti_calibration import read_calibration
 from lcf3d.datasets.opening import named, open_dataset
 from lcf3d.errors import Lcf3dError
 from tests.datasets.kitti_folder import CAMERA_FROM_LIDAR, LABELS, OBJECTS, P2, SIZE, make_kitti

@@ -116,7 +116,7 @@ def label_statistics(root: Path, ids: Sequence[str] | None = None) -> LabelStati
     """Statistics of the label files of a KITTI-layout folder."""
     folder = root / "training" / "label_2"
     chosen = list(ids) if ids is not None else [p.stem for p in list_files(folder, ".txt")]
-    frames = [read_folder(folder, [i], results=False)[0] for i in chosen]
+    frames = read_folder(folder, chosen, results=False)
     every = KittiObjects(
         *(
             np.concatenate([getattr(f, n) for f in frames])
