@@ -1,4 +1,4 @@
-"""Detectors on another dataset than the one they were trained on: adaptation and metrics (paper section 5.6).
+"""Detectors on another dataset than the one they were trained on: adaptation and metrics (paper section 5.8).
 
 Everything is evaluated in KITTI's three classes and in the front camera's view, which is all that KITTI annotates.
 """
@@ -87,7 +87,7 @@ def find_domain(name: str) -> SensorDomain:
 def adapt_points(
     points: NDArray[np.float32], tested: SensorDomain, trained: SensorDomain, camera: Camera | None = None
 ) -> NDArray[np.float32]:
-    """Points of one dataset as a detector expects them that was trained on the other (paper section 5.6).
+    """Points of one dataset as a detector expects them that was trained on the other (paper section 5.8).
 
     The ground is moved to the height it had in training, intensities are scaled, the time channel is set to zero
     where the data has none and left out where the detector knows none, and the scan is cut to the front camera's view
