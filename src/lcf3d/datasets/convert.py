@@ -1,6 +1,6 @@
 """Frames of any dataset written in the KITTI object layout or as nuScenes tables, for cross-dataset evaluation.
 
-Domain shift experiments (paper section 5.6) read one dataset with tools made for the other. Both writers take `Frame`
+Domain shift experiments (paper section 5.8) read one dataset with tools made for the other. Both writers take `Frame`
 objects, so they also serve sensors of one's own.
 """
 
