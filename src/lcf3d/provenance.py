@@ -80,6 +80,12 @@ REASON_TEXT = {
 }
 
 
+WHOLE = ("cluster", "lidar", "camera", "detection", "output", "pair")
+"""Columns of `Decisions` that hold numbers of something, -1 for none."""
+REAL = ("iou", "lidar_score", "camera_score", "score", "quality")
+"""Columns of `Decisions` that hold measures, NaN for none."""
+
+
 @dataclass(eq=False)
 class Decisions:
     """One row an input, in the order of the inputs; -1 and NaN stand for none.
@@ -119,30 +125,19 @@ class Decisions:
     @classmethod
     def blank(cls, n: int) -> Decisions:
         """``n`` rows of dropped inputs, all else unset; the fusion fills its columns."""
-        none, nan = np.full(n, -1, dtype=np.int64), np.full(n, np.nan)
-        return cls(
-            outcome=np.full(n, Outcome.DROPPED, dtype=np.int64),
-            reason=np.full(n, Reason.LOW_SCORE, dtype=np.int64),
-            cluster=none.copy(),
-            lidar=none.copy(),
-            camera=none.copy(),
-            detection=none.copy(),
-            iou=nan.copy(),
-            lidar_score=nan.copy(),
-            camera_score=nan.copy(),
-            score=nan.copy(),
-            output=none.copy(),
-            pair=none.copy(),
-            quality=nan.copy(),
-        )
+        # one block a type: a table is made for every frame
+        whole, real = np.full((len(WHOLE) + 2, n), -1, dtype=np.int64), np.full((len(REAL), n), np.nan)
+        whole[0], whole[1] = Outcome.DROPPED, Reason.LOW_SCORE
+        columns = dict(zip(("outcome", "reason", *WHOLE), whole, strict=True))
+        return cls(**columns, **dict(zip(REAL, real, strict=True)))
 
     def __len__(self) -> int:
         return len(self.outcome)
 
     def freeze(self) -> None:
         """Make all columns read-only: what was decided stays."""
-        for column in fields(self):
-            getattr(self, column.name).flags.writeable = False
+        for column in self.__dict__.values():
+            column.setflags(write=False)
 
     def row(self, index: int) -> dict[str, Any]:
         """One row in words and numbers, None where unset."""
@@ -150,10 +145,10 @@ class Decisions:
             "outcome": Outcome(self.outcome[index]).name.lower(),
             "reason": Reason(self.reason[index]).name.lower(),
         }
-        for name in ("cluster", "lidar", "camera", "detection", "output", "pair"):
+        for name in WHOLE:
             value = int(getattr(self, name)[index])
             result[name] = value if value >= 0 else None
-        for name in ("iou", "lidar_score", "camera_score", "score", "quality"):
+        for name in REAL:
             number = float(getattr(self, name)[index])
             result[name] = None if np.isnan(number) else number
         return result

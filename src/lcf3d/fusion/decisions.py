@@ -15,7 +15,7 @@ from lcf3d.fusion.recovery import Recovery
 from lcf3d.fusion.semantic import Ensemble, fuse_scores, semantic_fusion
 from lcf3d.geometry.iou import bev_iou
 from lcf3d.provenance import FusedDetections, Outcome, Reason
-from lcf3d.structures import BoolArray, Detections3D, FloatArray, IntArray
+from lcf3d.structures import BoolArray, Detections2D, Detections3D, FloatArray, IntArray, with_columns
 
 
 class ClusterDecisions(NamedTuple):
@@ -150,24 +150,20 @@ def assemble(
     decisions: ClusterDecisions,
     recovery: Recovery,
     notes: Sequence[str],
+    lidar_inputs: Detections3D,
+    camera_inputs: tuple[Detections2D, ...],
 ) -> FusedDetections:
     """Output detections, highest score first, and the reason for every input."""
-    surviving = np.flatnonzero(decisions.outcome != Outcome.DROPPED)
+    surviving = (decisions.outcome != Outcome.DROPPED).nonzero()[0]
     found = recovery.found
-    lidar = branches.lidar[decisions.box[surviving]]
-    detections = Detections3D.concatenate(
-        [
-            Detections3D(
-                lidar.boxes,
-                decisions.scores[surviving],
-                decisions.labels[surviving],
-                lidar.class_names,
-                lidar.velocities,
-                lidar.attributes,
-            ),
-            Detections3D(recovery.boxes[found], recovery.scores[found], recovery.labels[found], lidar.class_names),
-        ]
+    detections = with_columns(
+        branches.lidar[decisions.box[surviving]],
+        scores=decisions.scores[surviving],
+        labels=decisions.labels[surviving],
     )
+    if len(found):
+        recovered = recovery.boxes[found], recovery.scores[found], recovery.labels[found]
+        detections = Detections3D.concatenate([detections, Detections3D(*recovered, detections.class_names)])
     order = np.lexsort((*detections.boxes.T[::-1], -detections.scores))
     place = np.empty(len(order), dtype=np.int64)
     place[order] = np.arange(len(order))
@@ -181,8 +177,8 @@ def assemble(
         detections=detections[order],
         lidar=branches.lidar_table,
         camera=branches.camera_table,
-        lidar_inputs=Detections3D.empty(lidar.class_names),
-        camera_inputs=branches.camera_inputs,
+        lidar_inputs=lidar_inputs,
+        camera_inputs=camera_inputs,
         camera_names=tuple(c.name for c in branches.cameras),
         notes=(*branches.notes, *notes),
     )

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -89,8 +88,8 @@ class LateCascadeFusion:
         decisions = self._decide(branches, clusters, views, matches)  # (e) semantic fusion
         recovery, notes = self._recover(frame, branches, clusters, views, matches, decisions)  # (d) detection recovery
         decisions = replace_unconfirmed(decisions, branches.lidar, recovery, self.config.duplicate_iou)
-        fused = assemble(branches, clusters, views, matches, decisions, recovery, notes)
-        return replace(fused, lidar_inputs=lidar, camera_inputs=tuple(camera[name] for name in fused.camera_names))
+        given = tuple(camera[view.name] for view in branches.cameras)
+        return assemble(branches, clusters, views, matches, decisions, recovery, notes, lidar, given)
 
     def evidence(self, frame: Frame, lidar: Detections3D, camera: Mapping[str, Detections2D]) -> ClusterEvidence:
         """The evidence for every cluster of one frame, ``box`` counted in ``lidar``: what calibration is fitted on.
@@ -192,9 +191,9 @@ class LateCascadeFusion:
         class go first; of the others only decisive detections, which may change a label.
         """
         boxes = clusters.representative
-        judged = np.broadcast_to(self._detectable(branches, boxes, camera=camera)[:, None], (len(boxes), len(found)))
+        judged = self._detectable(branches, boxes, camera=camera)[:, None]
         if self.config.assignment != "class_first":
-            return [] if judged.all() else [judged]
+            return [] if judged.all() else [np.repeat(judged, len(found), axis=1)]
         equal = branches.lidar.labels[boxes][:, None] == found.labels[None]
         decisive = found.scores > self.config.decisive_score
         return [equal & judged, judged & decisive[None]]
