@@ -52,6 +52,10 @@ class Reason(IntEnum):
     POOR_FIT = 23
 
 
+OUTCOMES = tuple(outcome.name.lower() for outcome in Outcome)
+REASONS = tuple(reason.name.lower() for reason in Reason)
+"""Words of the codes, by code."""
+
 REASON_TEXT = {
     Reason.CONFIRMED: "a camera detection confirms the cluster",
     Reason.IN_CLUSTER: "a box of higher score represents its cluster",
@@ -128,8 +132,8 @@ class Decisions:
         # one block a type: a table is made for every frame
         whole, real = np.full((len(WHOLE) + 2, n), -1, dtype=np.int64), np.full((len(REAL), n), np.nan)
         whole[0], whole[1] = Outcome.DROPPED, Reason.LOW_SCORE
-        columns = dict(zip(("outcome", "reason", *WHOLE), whole, strict=True))
-        return cls(**columns, **dict(zip(REAL, real, strict=True)))
+        columns: dict[str, Any] = dict(zip(("outcome", "reason", *WHOLE, *REAL), (*whole, *real), strict=True))
+        return cls(**columns)
 
     def __len__(self) -> int:
         return len(self.outcome)
@@ -274,7 +278,7 @@ class FusedDetections:
     @property
     def dropped_lidar(self) -> IntArray:
         """Indices of the LiDAR detections that were dropped, without those that another box of theirs represents."""
-        merged = np.isin(self.lidar.reason, [Reason.IN_CLUSTER, Reason.SUPPRESSED])
+        merged = (self.lidar.reason == Reason.IN_CLUSTER) | (self.lidar.reason == Reason.SUPPRESSED)
         return np.flatnonzero((self.lidar.outcome == Outcome.DROPPED) & ~merged)
 
     def explain(self, output: int) -> str:

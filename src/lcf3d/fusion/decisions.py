@@ -129,11 +129,13 @@ def replace_unconfirmed(
     decisions: ClusterDecisions, lidar: Detections3D, recovery: Recovery, duplicate_iou: float
 ) -> ClusterDecisions:
     """Drop clusters kept without confirmation on whose spot a recovered box stands: one object comes out once."""
+    if not len(recovery.found):
+        return decisions
     kept = np.flatnonzero(
         np.isin(decisions.reason, [Reason.UNCONFIRMED, Reason.DOWNWEIGHTED, Reason.CLASS_NOT_DETECTED])
     )
     kept = kept[decisions.outcome[kept] == Outcome.KEPT]
-    if not len(kept) or not len(recovery.found):
+    if not len(kept):
         return decisions
     overlap = bev_iou(lidar.boxes[decisions.box[kept]], recovery.boxes[recovery.found])
     gone = kept[(overlap > duplicate_iou).any(axis=1)]

@@ -212,5 +212,7 @@ def confirmed_elsewhere(
     here; it is no candidate for recovery (docs/method.md, matching 7).
     """
     others = (matches.camera >= 0) & (views[at].match < 0)
+    if not others.any():
+        return np.zeros(len(boxes2d), dtype=bool)
     shown = image_iou(views[at].boxes[clusters.representative[others]], boxes2d)
     return np.asarray((shown > iou_threshold).any(axis=0))
