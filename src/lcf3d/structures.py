@@ -330,7 +330,7 @@ class Detections2D(Converters2D):
     def clipped(self, camera: Camera) -> Detections2D:
         """The same with boxes cut to the camera's image."""
         limits = np.array([camera.width, camera.height, camera.width, camera.height], dtype=np.float64)
-        return with_columns(self, boxes=np.clip(self.boxes, 0, limits))
+        return with_columns(self, boxes=np.minimum(np.maximum(self.boxes, 0), limits))
 
     def with_classes(self, class_names: Sequence[str], mapping: Mapping[str, str] | None = None) -> Detections2D:
         """The same detections with labels of ``class_names``; those of classes that map to none are dropped.
