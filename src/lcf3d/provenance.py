@@ -52,6 +52,10 @@ class Reason(IntEnum):
     POOR_FIT = 23
 
 
+OUTCOMES = tuple(outcome.name.lower() for outcome in Outcome)
+REASONS = tuple(reason.name.lower() for reason in Reason)
+"""Words of the codes, by code."""
+
 REASON_TEXT = {
     Reason.CONFIRMED: "a camera detection confirms the cluster",
     Reason.IN_CLUSTER: "a box of higher score represents its cluster",
@@ -78,6 +82,12 @@ REASON_TEXT = {
     Reason.SECOND_VIEW: "it confirms the cluster beside the more confident view of its stereo pair",
     Reason.UNPAIRED: "no LiDAR box matches it, and no detection of its stereo pair's other view shows the same object",
 }
+
+
+WHOLE = ("cluster", "lidar", "camera", "detection", "output", "pair")
+"""Columns of `Decisions` that hold numbers of something, -1 for none."""
+REAL = ("iou", "lidar_score", "camera_score", "score", "quality")
+"""Columns of `Decisions` that hold measures, NaN for none."""
 
 
 @dataclass(eq=False)
@@ -119,30 +129,19 @@ class Decisions:
     @classmethod
     def blank(cls, n: int) -> Decisions:
         """``n`` rows of dropped inputs, all else unset; the fusion fills its columns."""
-        none, nan = np.full(n, -1, dtype=np.int64), np.full(n, np.nan)
-        return cls(
-            outcome=np.full(n, Outcome.DROPPED, dtype=np.int64),
-            reason=np.full(n, Reason.LOW_SCORE, dtype=np.int64),
-            cluster=none.copy(),
-            lidar=none.copy(),
-            camera=none.copy(),
-            detection=none.copy(),
-            iou=nan.copy(),
-            lidar_score=nan.copy(),
-            camera_score=nan.copy(),
-            score=nan.copy(),
-            output=none.copy(),
-            pair=none.copy(),
-            quality=nan.copy(),
-        )
+        # one block a type: a table is made for every frame
+        whole, real = np.full((len(WHOLE) + 2, n), -1, dtype=np.int64), np.full((len(REAL), n), np.nan)
+        whole[0], whole[1] = Outcome.DROPPED, Reason.LOW_SCORE
+        columns: dict[str, Any] = dict(zip(("outcome", "reason", *WHOLE, *REAL), (*whole, *real), strict=True))
+        return cls(**columns)
 
     def __len__(self) -> int:
         return len(self.outcome)
 
     def freeze(self) -> None:
         """Make all columns read-only: what was decided stays."""
-        for column in fields(self):
-            getattr(self, column.name).flags.writeable = False
+        for column in self.__dict__.values():
+            column.setflags(write=False)
 
     def row(self, index: int) -> dict[str, Any]:
         """One row in words and numbers, None where unset."""
@@ -150,10 +149,10 @@ class Decisions:
             "outcome": Outcome(self.outcome[index]).name.lower(),
             "reason": Reason(self.reason[index]).name.lower(),
         }
-        for name in ("cluster", "lidar", "camera", "detection", "output", "pair"):
+        for name in WHOLE:
             value = int(getattr(self, name)[index])
             result[name] = value if value >= 0 else None
-        for name in ("iou", "lidar_score", "camera_score", "score", "quality"):
+        for name in REAL:
             number = float(getattr(self, name)[index])
             result[name] = None if np.isnan(number) else number
         return result
@@ -279,7 +278,7 @@ class FusedDetections:
     @property
     def dropped_lidar(self) -> IntArray:
         """Indices of the LiDAR detections that were dropped, without those that another box of theirs represents."""
-        merged = np.isin(self.lidar.reason, [Reason.IN_CLUSTER, Reason.SUPPRESSED])
+        merged = (self.lidar.reason == Reason.IN_CLUSTER) | (self.lidar.reason == Reason.SUPPRESSED)
         return np.flatnonzero((self.lidar.outcome == Outcome.DROPPED) & ~merged)
 
     def explain(self, output: int) -> str:

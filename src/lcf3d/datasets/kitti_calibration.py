@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +29,10 @@ DEFAULT_IMAGE_SIZE = (1242, 375)
 NEAR_MIDDLE = 0.1
 
 
+# calibrations that are kept: the files of a drive's frames are alike
+KEPT = 256
+
+
 @dataclass(frozen=True, eq=False)
 class KittiCalibration:
     """What a KITTI calibration file says.
@@ -46,11 +51,26 @@ class KittiCalibration:
 def read_calibration(path: Path) -> KittiCalibration:
     """Read a calibration file; spellings of the object, tracking and odometry benchmarks are understood.
 
+    Files of the same text give the same object.
+
     Raises:
         DatasetError: the file does not exist.
         FormatError: an entry is missing or malformed; names it.
     """
-    entries = read_entries(path)
+    text = _text(path)
+    if text not in _parsed:
+        if len(_parsed) >= KEPT:
+            _parsed.clear()
+        _parsed[text] = _parse_calibration(path, text)
+    return _parsed[text]
+
+
+_parsed: dict[str, KittiCalibration] = {}
+
+
+def _parse_calibration(path: Path, text: str) -> KittiCalibration:
+    """What the text of the calibration file at ``path`` says."""
+    entries = _parse_entries(path, text, ())
     rectification, reference_from_lidar = np.eye(4), np.eye(4)
     if "Tr" in entries:
         # odometry: from the Velodyne to the rectified reference camera at once
@@ -70,7 +90,11 @@ def read_calibration(path: Path) -> KittiCalibration:
     if "Tr_imu_to_velo" in entries or "Tr_imu_velo" in entries:
         lidar_from_imu = np.eye(4)
         lidar_from_imu[:3] = matrix_entry(path, entries, ("Tr_imu_to_velo", "Tr_imu_velo"), (3, 4))
-    return KittiCalibration(projections, rectification @ reference_from_lidar, lidar_from_imu)
+    camera_from_lidar = rectification @ reference_from_lidar
+    for matrix in (*projections.values(), camera_from_lidar, *(() if lidar_from_imu is None else (lidar_from_imu,))):
+        # frames share them
+        matrix.setflags(write=False)
+    return KittiCalibration(projections, camera_from_lidar, lidar_from_imu)
 
 
 # lines of raw drives that say when and how it was calibrated
@@ -84,10 +108,18 @@ def read_entries(path: Path, skip: Sequence[str] = ()) -> dict[str, FloatArray]:
         DatasetError: the file does not exist.
         FormatError: a line is malformed; names it.
     """
+    return _parse_entries(path, _text(path), skip)
+
+
+def _text(path: Path) -> str:
     try:
-        text = read_text(path)
+        return read_text(path)
     except DatasetError:
         raise DatasetError(f"calibration file {path} does not exist") from None
+
+
+def _parse_entries(path: Path, text: str, skip: Sequence[str]) -> dict[str, FloatArray]:
+    """See `read_entries`."""
     entries: dict[str, FloatArray] = {}
     for number, line in enumerate(text.splitlines(), 1):
         name, *fields = line.replace(":", " ").split() or [""]
@@ -173,8 +205,14 @@ def cameras_of(
             if known is None:
                 _require_default_size(name, matrix)
             size = known or DEFAULT_IMAGE_SIZE
-        cameras.append(Camera(name, matrix, calibration.camera_from_lidar, *size))
+        cameras.append(_camera(calibration, name, key, size))
     return cameras
+
+
+@lru_cache(maxsize=2 * KEPT)
+def _camera(calibration: KittiCalibration, name: str, key: str, size: tuple[int, int]) -> Camera:
+    """A camera; the frames of a drive share it, as they share the calibration."""
+    return Camera(name, calibration.projections[key], calibration.camera_from_lidar, *size)
 
 
 def parse_image_size(size: tuple[int, int] | str | None) -> tuple[int, int] | None:

@@ -14,13 +14,11 @@ import numpy as np
 
 from lcf3d.errors import ConfigError, FormatError
 from lcf3d.files import atomic_path
-from lcf3d.provenance import Decisions, FusedDetections, Outcome, Reason, TrackTable
+from lcf3d.provenance import REAL, WHOLE, Decisions, FusedDetections, Outcome, Reason, TrackTable
 from lcf3d.structures import Detections2D, Detections3D
 
 SCHEMA = "1"
 _KEY = b"lcf3d.schema"
-_WHOLE = ("cluster", "lidar", "camera", "detection", "output", "pair")
-_REAL = ("iou", "lidar_score", "camera_score", "score", "quality")
 
 
 def arrow() -> Any:
@@ -50,8 +48,8 @@ def frame_schema() -> Any:
     decisions = [
         ("outcome", pa.list_(pa.string())),
         ("reason", pa.list_(pa.string())),
-        *((name, pa.list_(pa.int64())) for name in _WHOLE),
-        *((name, pa.list_(pa.float64())) for name in _REAL),
+        *((name, pa.list_(pa.int64())) for name in WHOLE),
+        *((name, pa.list_(pa.float64())) for name in REAL),
     ]
     tracks = [
         (column.name, pa.list_(pa.int64() if column.name in ("ids", "hits") else pa.float64()))
@@ -188,9 +186,9 @@ def _columns(decisions: Decisions) -> dict[str, Any]:
         "outcome": [Outcome(code).name.lower() for code in decisions.outcome.tolist()],
         "reason": [Reason(code).name.lower() for code in decisions.reason.tolist()],
     }
-    for name in _WHOLE:
+    for name in WHOLE:
         columns[name] = [value if value >= 0 else None for value in getattr(decisions, name).tolist()]
-    for name in _REAL:
+    for name in REAL:
         columns[name] = [None if value != value else value for value in getattr(decisions, name).tolist()]
     return columns
 

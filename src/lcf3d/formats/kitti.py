@@ -247,7 +247,7 @@ def format_objects(objects: KittiObjects) -> str:
 
 def detections_2d(objects: KittiObjects, class_names: Sequence[str]) -> Detections2D:
     """The 2D boxes of the objects whose class is in ``class_names``; labels get score 1."""
-    labels = _labels(objects, class_names)
+    labels = labels_of(objects, class_names)
     kept = labels >= 0
     scores = np.ones(len(objects)) if objects.scores is None else objects.scores
     return Detections2D(objects.boxes2d[kept], scores[kept], labels[kept], tuple(class_names))
@@ -261,7 +261,7 @@ def detections_3d(objects: KittiObjects, camera_from_lidar: FloatArray, class_na
         camera_from_lidar: (4, 4) rectified reference camera from LiDAR, ``R0_rect @ Tr_velo_to_cam``.
         class_names: classes to keep; labels index them. Ground truth gets score 1.
     """
-    labels = _labels(objects, class_names)
+    labels = labels_of(objects, class_names)
     kept = (labels >= 0) & objects.has_box3d
     boxes = lidar_from_kitti(
         objects.locations[kept], objects.dimensions[kept], objects.rotation_y[kept], camera_from_lidar
@@ -322,7 +322,7 @@ def renamed(objects: KittiObjects, name: str, target: str) -> KittiObjects:
     return replace(objects, class_names=np.array([target if n == name else n for n in names], dtype=np.str_))
 
 
-def _labels(objects: KittiObjects, class_names: Sequence[str]) -> IntArray:
+def labels_of(objects: KittiObjects, class_names: Sequence[str]) -> IntArray:
     """(N,) index of each object's class in ``class_names``, -1 for the others."""
     labels = np.full(len(objects), -1, dtype=np.int64)
     for i, name in enumerate(class_names):

@@ -57,26 +57,27 @@ def gather_evidence(
         camera_scores[here] = found.scores[matches.detection[here]]
         labels[here] = found.labels[matches.detection[here]]
         plain = miss_exposure(view.boxes[box], camera.width, camera.height)
-        plain = np.where(cut_by_field(view.boxes[box], camera), 0.0, plain)
-        exposure = np.maximum(exposure, np.where(view.visible, plain, 0.0))
+        plain[~view.visible | cut_by_field(view.boxes[box], camera)] = 0.0
+        np.maximum(exposure, plain, out=exposure)
     table = evidence_table(
         to_log_odds(lidar.scores),
         competing_scores(lidar.boxes, lidar.scores, lidar.labels, config),
         ground_slope(lidar.boxes, calibration.ground_z),
         exposure,
         camera_scores,
-        np.where(matches.camera >= 0, np.nan_to_num(matches.iou), 0.0),
+        np.where(matches.camera >= 0, matches.iou, 0.0),
     )
     return ClusterEvidence(box, table, lidar.labels, labels == lidar.labels)
 
 
-def fused_scores(weighed: ClusterEvidence, config: FusionConfig, calibration: Calibration) -> FloatArray:
-    """(C,) probability of every cluster."""
-    scores = np.zeros(len(weighed.box))
-    for label, name in enumerate(config.class_names):
+def fused_scores(weighed: ClusterEvidence, weights: Sequence[FloatArray]) -> FloatArray:
+    """(C,) probability of every cluster, by the weights of its class."""
+    log_odds = np.zeros(len(weighed.box))
+    for label, own_weights in enumerate(weights):
         own = weighed.labels == label
-        scores[own] = to_probability(weighed.table[own] @ evidence_of(name, config, calibration).weights)
-    return scores
+        if own.any():
+            log_odds[own] = weighed.table[own] @ own_weights
+    return to_probability(log_odds)
 
 
 def evidence_of(name: str, config: FusionConfig, calibration: Calibration) -> Evidence:
@@ -96,7 +97,7 @@ def competing_scores(boxes: FloatArray, scores: FloatArray, labels: IntArray, co
     here it loses evidence instead.
     """
     competing = np.zeros(len(boxes))
-    if not config.class_aware or len(np.unique(labels)) < 2:
+    if not config.class_aware or not len(labels) or (labels == labels[0]).all():
         return competing
     cluster = cluster_boxes(boxes, scores, labels, method="cliques", iou_threshold=config.cluster_iou).index
     order = np.lexsort((labels, cluster))
