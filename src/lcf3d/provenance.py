@@ -141,8 +141,8 @@ class Decisions:
 
     def freeze(self) -> None:
         """Make all columns read-only: what was decided stays."""
-        for column in fields(self):
-            getattr(self, column.name).flags.writeable = False
+        for column in vars(self).values():
+            column.flags.writeable = False
 
     def row(self, index: int) -> dict[str, Any]:
         """One row in words and numbers, None where unset."""

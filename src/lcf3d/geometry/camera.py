@@ -87,9 +87,7 @@ def project_boxes(boxes: FloatArray, camera: Camera) -> tuple[FloatArray, BoolAr
         _bound_projections(box_corners(boxes), EDGES, np.array(camera.pixels_from_lidar), NEAR, bounds)
     else:
         bound_through_lens(boxes, box_corners(boxes), EDGES, lens_numbers(camera), bounds)
-    clipped = np.empty_like(bounds)
-    np.clip(bounds[:, 0::2], 0, camera.width, out=clipped[:, 0::2])
-    np.clip(bounds[:, 1::2], 0, camera.height, out=clipped[:, 1::2])
+    clipped = np.minimum(np.maximum(bounds, 0.0), (camera.width, camera.height, camera.width, camera.height))
     visible = (clipped[:, 2] > clipped[:, 0]) & (clipped[:, 3] > clipped[:, 1])
     clipped[~visible] = 0
     return clipped, visible
