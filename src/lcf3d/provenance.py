@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, fields, replace
 from enum import IntEnum
 from typing import Any
@@ -261,7 +262,9 @@ class FusedDetections:
         place = np.empty(len(order) + 1, dtype=np.int64)
         place[order] = np.arange(len(order))
         place[-1] = -1  # no output before, none now
-        tables = [replace(table, output=place[table.output]) for table in (self.lidar, self.camera)]
+        tables = [copy(self.lidar), copy(self.camera)]
+        for table in tables:
+            table.output = place[table.output]
         return replace(self, detections=detections, lidar=tables[0], camera=tables[1], tracks=tracks)
 
     @property
