@@ -63,7 +63,7 @@ def simulate(root: Path, preset: str, count: int) -> None:
 
     recipes = {
         root / "lidar": SampleRecipe("lidar", preset, 1, SEED),
-        root / "camera": SampleRecipe("camera", preset, 1, SEED, 0.67),
+        root / "camera": SampleRecipe("camera", preset, 1, SEED),
     }
     for folder in recipes:
         folder.mkdir(parents=True, exist_ok=True)
@@ -123,7 +123,7 @@ def measure(name: str, path: Path, options: argparse.Namespace) -> dict[str, Any
 def measure_camera(path: Path, options: argparse.Namespace) -> dict[str, Any]:
     """AP, masks and calibration of a camera detector."""
     from lcf3d.detectors.camera.onnx import OnnxDetector
-    from lcf3d.training.camera import INPUT_SIZE
+    from lcf3d.detectors.camera.small import INPUT_SIZE
     from lcf3d.training.camera_evaluation import evaluate_detector
     from lcf3d.training.camera_images import drive_images, read_kitti, read_samples
 
