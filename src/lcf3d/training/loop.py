@@ -296,7 +296,7 @@ class _Run:
             # torch reports a full disk as a RuntimeError of its own
             reason = getattr(error, "strerror", None) or str(error).splitlines()[0]
             raise DatasetError(
-                f"cannot write {self.folder / LAST}: {reason}; the checkpoint before stays: make room, go on with --resume"
+                f"cannot write {self.folder / LAST}: {reason}; the one before stays: make room, go on with --resume"
             ) from error
         return figures
 
