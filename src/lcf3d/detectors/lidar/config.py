@@ -140,6 +140,8 @@ class LidarConfig:
             everything is canonical.
         cloud: what it was trained on: earlier sweeps, or the part that a camera sees.
         tall: points above and below the volume stay among the raw points of a two-stage network (OpenPCDet).
+        upright: classes whose boxes are held against the heights of the returns in them, see
+            `lcf3d.detectors.lidar.upright`.
     """
 
     name: str
@@ -158,6 +160,7 @@ class LidarConfig:
     frame: str = "canonical"
     cloud: CloudRequest = SCAN
     tall: bool = False
+    upright: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if self.ground not in GROUND_MODES:

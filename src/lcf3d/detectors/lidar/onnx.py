@@ -14,6 +14,7 @@ from lcf3d.detectors.lidar.config import LidarConfig
 from lcf3d.detectors.lidar.grounding import ground_of, grounded, levelled
 from lcf3d.detectors.lidar.inputs import encoder_inputs, map_detections
 from lcf3d.detectors.lidar.suppression import NmsMode, suppression_threshold
+from lcf3d.detectors.lidar.upright import checked
 from lcf3d.errors import ConfigError, DetectorError
 from lcf3d.networks.onnx import open_session
 from lcf3d.structures import Detections3D
@@ -74,7 +75,7 @@ class OnnxLidarDetector:
             velocities = np.zeros((0, 2)) if self.config.has_velocity else None
             return Detections3D(np.zeros((0, 7)), np.zeros(0), np.zeros(0, np.int64), self.class_names, velocities)
         found = map_detections(self.maps(inputs), self.config, self.score_threshold, self.nms)
-        return grounded(found, ground, self.config)
+        return checked(grounded(found, ground, self.config), points, self.config, self.score_threshold)
 
     def maps(self, inputs: dict[str, NDArray[Any]]) -> list[Any]:
         """The head's maps, without batch axis, from the arrays of `encoder_inputs`."""

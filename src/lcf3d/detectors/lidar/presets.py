@@ -227,6 +227,7 @@ COMPACT_KITTI = LidarConfig(
     ),
     encoding="statistics",
     ground="level",
+    upright=("Pedestrian", "Cyclist"),
 )
 
 PRESETS: dict[str, LidarConfig] = {
