@@ -230,6 +230,8 @@ class Detections3D(Converters3D):
 
         ``mapping`` goes from own name to new name; names missing from it (or all, without it) keep their name.
         """
+        if mapping is None and tuple(class_names) == self.class_names:
+            return self
         kept, labels = _relabel(self.labels, self.class_names, class_names, mapping)
         selected = self[kept]
         return replace(selected, labels=labels, class_names=tuple(class_names))
@@ -300,6 +302,8 @@ class Detections2D(Converters2D):
 
         ``mapping`` goes from own name to new name; names missing from it (or all, without it) keep their name.
         """
+        if mapping is None and tuple(class_names) == self.class_names:
+            return self
         kept, labels = _relabel(self.labels, self.class_names, class_names, mapping)
         selected = self[kept]
         return replace(selected, labels=labels, class_names=tuple(class_names))

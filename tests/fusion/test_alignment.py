@@ -19,7 +19,7 @@ from lcf3d.fusion.alignment import (
     vector_of,
 )
 from lcf3d.fusion.alignment_matching import Sighting, vote_rotation
-from lcf3d.fusion.alignment_watch import AlignmentWatch, WatchSettings, estimate
+from lcf3d.fusion.alignment_watch import AlignmentWatch, WatchSettings, estimate, judge
 from lcf3d.geometry.camera import project_boxes, project_points
 from lcf3d.structures import Camera, Detections2D, Frame
 from tests.fusion.scenes import CAR, PEDESTRIAN, camera, car, lidar, pedestrian
@@ -179,6 +179,16 @@ def test_what_stands_is_sure_to_and_what_moves_is_not():
     detections = replace(lidar(boxes, [0.9, 0.8]), velocities=np.array([[1.0, 0.5], [3.0, 0.0]]))
     sighting = Sighting.of(view, detections, found, np.zeros((2, 3)))
     assert sighting.unsure.tolist() == [0.0, 0.5]
+
+
+def test_an_estimate_that_needs_impossible_boxes_raises_no_alarm():
+    state = np.zeros(9)
+    state[1] = np.deg2rad(5.0)
+    sure = Alignment(state, np.diag(np.full(9, 1e-8)), 40)
+    assert judge(sure, WatchSettings()) == "wrong"
+    state = state.copy()
+    state[6] = 0.25
+    assert judge(replace(sure, state=state), WatchSettings()) == "unknown"
 
 
 def test_displacement_is_held_near_zero_unless_many_pairs_ask_for_it():

@@ -379,7 +379,7 @@ class Fuser:
             timestamp=group.time,
             world_from_lidar=self._poses.at(group.time),
         )
-        return frame, frame.with_cameras(nominal)
+        return frame, frame.with_cameras(nominal) if corrected else frame
 
     def _moved(self, camera: Camera, time: float, shift: float) -> Camera:
         """A camera as it stood ``shift`` seconds after a scan, seen from the LiDAR at the scan."""

@@ -16,6 +16,8 @@ CARRY_ON = 0.25
 BASE = 0.1
 # poses older than this before the newest are forgotten
 KEPT = 5.0
+# answers that are kept between two poses
+MOST_ANSWERS = 256
 
 
 class PoseBuffer:
@@ -24,6 +26,8 @@ class PoseBuffer:
     def __init__(self) -> None:
         self._times: list[float] = []
         self._poses: dict[float, FloatArray] = {}
+        # what was asked for since the newest pose: every camera of a moment asks for the scan's
+        self._answers: dict[float, FloatArray | None] = {}
 
     def __len__(self) -> int:
         return len(self._times)
@@ -38,11 +42,19 @@ class PoseBuffer:
         if time not in self._poses:
             insort(self._times, time)
             self._poses[time] = np.asarray(world_from_lidar, dtype=np.float64)
+            self._answers.clear()
         while self._times[0] < self._times[-1] - KEPT:
             del self._poses[self._times.pop(0)]
 
     def at(self, time: float) -> FloatArray | None:
         """(4, 4) ``world_from_lidar`` at a moment; None where no poses are near enough."""
+        if time not in self._answers:
+            if len(self._answers) >= MOST_ANSWERS:
+                self._answers.clear()
+            self._answers[time] = self._at(time)
+        return self._answers[time]
+
+    def _at(self, time: float) -> FloatArray | None:
         if not self._times:
             return None
         i = bisect_left(self._times, time)
