@@ -197,7 +197,7 @@ def write_pictures(frames: Sequence[DemoFrame], folder: Path) -> list[Path]:
     for item in frames:
         picture = draw_frame(item.frame, Scene.from_fused(item.fused, item.frame.labels, DRAWN_SCORE))
         paths.append(folder / f"{item.frame.id}.png")
-        save_png(picture, paths[-1], compression=1)
+        save_png(picture, paths[-1])
         # a palette found by median cut takes longer than all the rest
         pictures.append(picture.reduce(2).quantize(method=Image.Quantize.FASTOCTREE))
     paths.append(folder / "drive.gif")

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import struct
+import zlib
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import PIL.Image
+from numpy.typing import NDArray
 
 from lcf3d.files import atomic_path
 from lcf3d.structures import Camera, Frame
@@ -52,10 +55,28 @@ def draw_frame(frame: Frame, scene: Scene, cameras: Sequence[str] | None = None,
     return _stack([_legend(frame.id, scene, width), *rows])
 
 
-def save_png(picture: PIL.Image.Image, path: Path, compression: int = 6) -> None:
-    """Write a picture as PNG, whole or not at all; ``compression`` 0 to 9, 1 is twice as quick as 6."""
+def save_png(picture: PIL.Image.Image, path: Path) -> None:
+    """Write a picture as PNG, whole or not at all."""
     with atomic_path(Path(path)) as temporary:
-        picture.save(temporary, format="PNG", compress_level=compression)
+        temporary.write_bytes(png_bytes(np.asarray(picture.convert("RGB"))))
+
+
+def png_bytes(pixels: NDArray[np.uint8]) -> bytes:
+    """(H, W, 3) uint8 RGB as a PNG file: each row as differences to the pixel before, weakly compressed.
+
+    For pictures with much photograph in them that is as small as trying all filters, in a third of the time.
+    """
+    height, width, _ = pixels.shape
+    rows = pixels.reshape(height, 3 * width)
+    filtered = np.empty((height, 1 + 3 * width), np.uint8)
+    filtered[:, 0] = 1
+    filtered[:, 1:4] = rows[:, :3]
+    np.subtract(rows[:, 3:], rows[:, :-3], out=filtered[:, 4:])
+    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    chunks = ((b"IHDR", header), (b"IDAT", zlib.compress(filtered.data, 1)), (b"IEND", b""))
+    return b"\x89PNG\r\n\x1a\n" + b"".join(
+        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)) for kind, data in chunks
+    )
 
 
 def _shown_cameras(frame: Frame, names: Sequence[str] | None) -> list[Camera]:
