@@ -67,9 +67,14 @@ class OnnxLidarDetector:
         """The classes that labels index."""
         return self.config.class_names
 
-    def __call__(self, points: NDArray[np.floating]) -> Detections3D:
-        """Detections in (N, 4 or more) points, as of `lcf3d.detectors.lidar.detector.TorchLidarDetector`."""
-        ground = ground_of(points, self.config)
+    def __call__(self, points: NDArray[np.floating], around: NDArray[np.floating] | None = None) -> Detections3D:
+        """Detections in (N, 4 or more) points, as of `lcf3d.detectors.lidar.detector.TorchLidarDetector`.
+
+        Args:
+            points: the cloud.
+            around: the whole scan, to find the ground in, where ``points`` are a part of it.
+        """
+        ground = ground_of(points if around is None else around, self.config)
         inputs = encoder_inputs(levelled(points, ground, self.config), self.config)
         if inputs is None:
             velocities = np.zeros((0, 2)) if self.config.has_velocity else None
