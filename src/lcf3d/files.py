@@ -36,11 +36,15 @@ def atomic_path(path: Path) -> Iterator[Path]:
     Raises:
         OSError: no place left, no permission ...; names ``path``.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f"{_TEMPORARY}.{os.getpid()}.{path.name}")
+    folder = path.parent
+    if not os.path.isdir(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+    temporary = folder / f"{_TEMPORARY}.{os.getpid()}.{path.name}"
+    moved = False
     try:
         yield temporary
         os.replace(temporary, path)
+        moved = True
     except OSError as error:
         # the file that was to be written, not the one that nobody knows
         if error.errno == errno.ENOSPC:
@@ -49,7 +53,8 @@ def atomic_path(path: Path) -> Iterator[Path]:
             raise OSError(error.errno, error.strerror, str(path)) from None
         raise
     finally:
-        temporary.unlink(missing_ok=True)
+        if not moved:
+            temporary.unlink(missing_ok=True)
 
 
 def is_hidden(path: Path) -> bool:
@@ -202,8 +207,8 @@ def read_text(path: Path) -> str:
 
 def write_text(path: Path, text: str) -> None:
     """Write ``text`` to ``path``, whole or not at all."""
-    with atomic_path(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+    with atomic_path(path) as temporary, open(temporary, "wb") as file:
+        file.write(text.encode())
 
 
 def write_json(path: Path, value: Any, indent: int | None = 2) -> None:
