@@ -293,6 +293,15 @@ class FusedDetections:
         return outcomes
 
     @property
+    def origins(self) -> list[str]:
+        """What became of every output, in words: an `Outcome`, or ``downweighted`` where no camera confirms it."""
+        names = [Outcome(outcome).name.lower() for outcome in self.outcomes]
+        lowered = self.lidar.output[self.lidar.reason == Reason.DOWNWEIGHTED]
+        for output in lowered[lowered >= 0]:
+            names[output] = "downweighted"
+        return names
+
+    @property
     def dropped_lidar(self) -> IntArray:
         """Indices of the LiDAR detections that were dropped, without those that another box of theirs represents."""
         merged = (self.lidar.reason == Reason.IN_CLUSTER) | (self.lidar.reason == Reason.SUPPRESSED)

@@ -187,10 +187,7 @@ def measure(frames: list[DemoFrame]) -> DemoResult:
 
 def write_pictures(frames: Sequence[DemoFrame], folder: Path) -> list[Path]:
     """One PNG a frame and an animation; gives the paths written."""
-    from PIL import Image
-
-    from lcf3d.files import atomic_path
-    from lcf3d.visualization.png import draw_frame, save_png
+    from lcf3d.visualization.png import draw_frame, save_gif, save_png
     from lcf3d.visualization.scene import Scene
 
     pictures, paths = [], []
@@ -198,9 +195,7 @@ def write_pictures(frames: Sequence[DemoFrame], folder: Path) -> list[Path]:
         picture = draw_frame(item.frame, Scene.from_fused(item.fused, item.frame.labels, DRAWN_SCORE))
         paths.append(folder / f"{item.frame.id}.png")
         save_png(picture, paths[-1])
-        # a palette found by median cut takes longer than all the rest
-        pictures.append(picture.reduce(2).quantize(method=Image.Quantize.FASTOCTREE))
+        pictures.append((None, picture))
     paths.append(folder / "drive.gif")
-    with atomic_path(paths[-1]) as temporary:
-        pictures[0].save(temporary, save_all=True, append_images=pictures[1:], duration=200, loop=0, format="GIF")
+    save_gif(pictures, paths[-1])
     return paths

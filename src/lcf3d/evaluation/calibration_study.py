@@ -99,7 +99,7 @@ class CalibrationStudy:
     ) -> None:
         self.frames, self.evaluation, self.config, self.folds = list(frames), evaluation, config, folds
         self.lidar_inputs, self.camera_inputs, self.sources = list(lidar), list(camera), sources
-        self._progress = progress
+        self.progress = progress
         if not any(len(found) for found in self.lidar_inputs):
             names = ", ".join(config.class_names)
             raise DatasetError(f"the LiDAR results hold no 3D boxes of {names}: nothing to calibrate")
@@ -152,7 +152,7 @@ class CalibrationStudy:
         fusion = LateCascadeFusion(self.config, _no_localizer, calibration)
         starts = np.concatenate([[0], np.cumsum([len(found) for found in self.lidar_inputs])])
         parts, places = [], []
-        for i in self._progress([int(f) for f in frames]):
+        for i in self.progress([int(f) for f in frames]):
             frame = self.frames[i]
             part = fusion.evidence(frame, self.lidar_inputs[i], self.camera_inputs[i])
             parts.append(part)

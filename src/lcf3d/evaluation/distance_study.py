@@ -13,7 +13,7 @@ from lcf3d.evaluation.center_distance import EvaluationBoxes, class_curves, matc
 from lcf3d.evaluation.reliability import reliability
 from lcf3d.evaluation.study import DISTANCE_RANGES, ClassStudy, DistanceRow, FusionOutcomes, ShownBox, Study
 from lcf3d.geometry.camera import project_boxes
-from lcf3d.provenance import FusedDetections, Outcome, Reason
+from lcf3d.provenance import FusedDetections, Reason
 from lcf3d.structures import BoolArray, Camera, Detections3D, FloatArray, IntArray
 
 MATCH_M = 2.0
@@ -210,7 +210,7 @@ def _fusion_outcomes(
         fused = provenance.get(frame_id)
         if fused is None:
             continue
-        origin = output_origins(fused)
+        origin = fused.origins
         for row in point.kept[(point.kept >= starts[f]) & (point.kept < starts[f + 1])]:
             _count(outcomes["right" if point.matches[row] >= 0 else "wrong"], origin[row - starts[f]])
         lost = point.objects[(truth.frames[point.objects] == f) & point.missed[point.objects]]
@@ -234,16 +234,6 @@ def _fusion_outcomes(
     return FusionOutcomes(
         outcomes["right"], outcomes["wrong"], outcomes["dropped_wrong"], outcomes["dropped_right"], misses
     )
-
-
-def output_origins(fused: FusedDetections) -> list[str]:
-    """What the fusion did to each of its outputs, in words."""
-    names = ["kept"] * len(fused.detections)
-    for table in (fused.camera, fused.lidar):
-        for row in np.flatnonzero(table.output >= 0).tolist():
-            lowered = table.reason[row] == Reason.DOWNWEIGHTED
-            names[table.output[row]] = "downweighted" if lowered else Outcome(int(table.outcome[row])).name.lower()
-    return names
 
 
 def _count(counts: dict[str, int], name: str) -> None:

@@ -16,6 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from lcf3d.errors import ConfigError
 from lcf3d.files import read_json, write_text
 from lcf3d.fusion.evidence import Evidence, to_probability
+from lcf3d.fusion.memory_config import ClassMemory
 from lcf3d.structures import Detections, Detections2D, Detections3D, FloatArray, with_columns
 
 Transform = Literal["identity", "log", "logit"]
@@ -97,6 +98,8 @@ class Calibration(BaseModel):
         camera_classes: the classes that the camera branch detects at all, None if all: boxes of other classes are not
             judged by it.
         ground_z: height of the ground under the sensor, LiDAR frame, metres; None if unknown.
+        memory: how objects are remembered, by class (``lcf3d calibrate --memory``); classes left out take the defaults
+            of their kind.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -108,6 +111,7 @@ class Calibration(BaseModel):
     evidence: dict[str, Evidence] = Field(default_factory=dict)
     camera_classes: tuple[str, ...] | None = None
     ground_z: float | None = None
+    memory: dict[str, ClassMemory] = Field(default_factory=dict)
 
     @classmethod
     def load(cls, path: Path | str) -> Calibration:

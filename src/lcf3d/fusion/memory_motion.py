@@ -60,7 +60,9 @@ def predict(tracks: Tracks, elapsed_s: float, motion: Motion) -> Tracks:
     t = float(elapsed_s)
     powers = (t, t * t, t**3, t**4)
     yaw_rate_share = float(np.exp(-t / YAW_RATE_MEMORY_S))
-    _predict(tracks.values, tracks.numbers, motion.turns, motion.acceleration, powers, yaw_rate_share, fading(t), values)
+    _predict(
+        tracks.values, tracks.numbers, motion.turns, motion.acceleration, powers, yaw_rate_share, fading(t), values
+    )
     return Tracks(tracks.numbers, values)
 
 

@@ -11,7 +11,6 @@ from lcf3d.fusion.memory_config import ClassColumns, MemoryConfig
 from lcf3d.geometry.boxes import HEIGHT, LENGTH, YAW, Z
 from lcf3d.structures import Camera, FloatArray, Frame, IntArray
 
-
 # columns of `Tracks.numbers` and `Tracks.values`
 ID, LABEL, HITS = range(3)
 (

@@ -9,7 +9,7 @@ import numpy as np
 
 from lcf3d.fusion.evidence import to_log_odds, to_probability
 from lcf3d.fusion.memory_association import associate
-from lcf3d.fusion.memory_config import ClassColumns, MemoryConfig
+from lcf3d.fusion.memory_config import MemoryConfig
 from lcf3d.fusion.memory_evidence import CAMERA, HIDDEN, frame_support, missed_log_odds, seen_log_odds
 from lcf3d.fusion.memory_motion import begin, measure, predict
 from lcf3d.fusion.memory_prediction import free_camera_scores, free_share, hidden_share, seen_by, views_of
@@ -131,9 +131,7 @@ def _looked(memory: Memory, seen: _Seen, elapsed_s: float) -> BoolArray:
     return looked
 
 
-def _updated(
-    tracks: Tracks, seen: _Seen, found: Detections3D, memory: Memory, time: float
-) -> tuple[Tracks, IntArray]:
+def _updated(tracks: Tracks, seen: _Seen, found: Detections3D, memory: Memory, time: float) -> tuple[Tracks, IntArray]:
     """The tracks with what the frame saw of them, and then those that begin; and (N,) the row of each detection's."""
     old, new = seen.match >= 0, seen.match < 0
     n_new = int(new.sum())
