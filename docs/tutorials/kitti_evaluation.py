@@ -77,4 +77,4 @@ for name in dataset.class_names:
 # %% [markdown]
 # Ten frames of one street prove nothing: with fewer than 41 objects of a class not even perfect results reach 100. On real
 # data ask for intervals: `lcf3d eval kitti:KITTI --compare alone fused` draws frames again a thousand times. What KITTI's
-# protocol does, with its quirks, is in [Evaluation](../evaluation.md).
+# protocol does, with its quirks, is in [Evaluation](../../evaluation/).

@@ -82,4 +82,4 @@ for status in fuser.diagnostics():
 
 # %% [markdown]
 # The same on a data set: `lcf3d live kitti:KITTI --lidar results:DIR --camera results:DIR`. ROS 2, moving cameras, clocks
-# and deadlines are in [Live](../live.md).
+# and deadlines are in [Live](../../live/).

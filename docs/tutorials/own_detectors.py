@@ -27,7 +27,7 @@ print((work / "drive" / "sensors.yaml").read_text())
 
 # %% [markdown]
 # With data of your own, `lcf3d init drive` writes a first `sensors.yaml`, and you put in your calibration: see
-# [My own data](../my-own-data.md). Opened as a data set, a frame gives points, images and cameras, and the check says
+# [My own data](../../my-own-data/). Opened as a data set, a frame gives points, images and cameras, and the check says
 # whether they agree.
 
 # %%
@@ -85,7 +85,7 @@ lcf3d.draw(dataset[0], fused[dataset[0].id], min_score=0.2)
 # %% [markdown]
 # Green boxes were matched with a camera detection (yellow), orange ones recovered from it, pink ones were doubted because
 # no camera detection confirms them. Thin white is the ground truth. What became of each box is in
-# [Reading reasons](reading_reasons.py).
+# [Reading reasons](../reading_reasons/).
 #
 # Average precision by centre distance, LiDAR alone and fused:
 
@@ -95,4 +95,4 @@ for name in ("lidar_results", "fused"):
     print(f"{name:14} mean AP {100 * metrics['mean_ap']:.1f}")
 
 # %% [markdown]
-# Five frames are an example, not a measurement. Next: [KITTI evaluation](kitti_evaluation.py).
+# Five frames are an example, not a measurement. Next: [KITTI evaluation](../kitti_evaluation/).

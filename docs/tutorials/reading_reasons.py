@@ -70,5 +70,5 @@ paper = LateCascadeFusion(FusionConfig.preset("kitti").updated(unmatched="drop")
 print("default:", len(fused.detections), "boxes;  deleting:", len(paper(frame, lidar, {"left": camera}).detections))
 
 # %% [markdown]
-# All reasons are listed in [Reading the reasons](../reasons.md). On disk, `provenance/ID.json` of a run holds the same, and
+# All reasons are listed in [Reading the reasons](../../reasons/). On disk, `provenance/ID.json` of a run holds the same, and
 # `lcf3d view RUN` draws it.

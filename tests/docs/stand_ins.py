@@ -59,6 +59,7 @@ def write_base(root: Path) -> None:
     make_kitti(root / "DRIVES", DRIVE)
     scans = make_tracking(root / "TRACKING", ("0000",)) / "training" / "velodyne" / "0000"
     shutil.copy(scans / "000000.bin", scans / "000001.bin")
+    shutil.copytree(root / "TRACKING/training/label_02", root / "DRIVES/training/label_02")
     make_raw(root / "RAW")
     write_drive_with_objects(root / "drive.mcap")
     _other_tools(root)
