@@ -74,13 +74,13 @@ class KittiLikeDataset(BaseDataset):
         """3D detections of KITTI result files."""
         from lcf3d.datasets.kitti_results import KittiLidarResults
 
-        return KittiLidarResults(path, class_names, missing)
+        return KittiLidarResults(Path(path), class_names, missing)
 
     def camera_results(self, path: Path, class_names: Sequence[str], missing: str = "error") -> CameraSource:
         """2D detections of KITTI result files."""
         from lcf3d.datasets.kitti_results import KittiCameraResults
 
-        return KittiCameraResults(path, class_names, missing)
+        return KittiCameraResults(Path(path), class_names, missing)
 
     def writer(self, folder: Path) -> ResultWriter:
         """A KITTI result file a frame."""
