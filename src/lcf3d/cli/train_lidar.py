@@ -42,10 +42,12 @@ def lidar(
     learning_rate: Annotated[float, typer.Option(help="highest one of the schedule")] = 3e-3,
     tilt: Annotated[float, typer.Option(min=0, help="degrees that scans are tilted by at most")] = 0.0,
     paint: Annotated[
-        str, typer.Option(help="PointPainting: what gives points class scores, masks:shipped:kitti, onnx:FILE?classes=..")
+        str,
+        typer.Option(help="PointPainting: what gives points class scores, for example masks:shipped:kitti"),
     ] = "",
     frustums: Annotated[
-        str, typer.Option(help="Frustum PointPillars: camera detector whose boxes cut frustums, for example shipped:kitti")
+        str,
+        typer.Option(help="Frustum PointPillars: whose boxes cut frustums, for example shipped:kitti"),
     ] = "",
     init: Annotated[
         str, typer.Option(help="weights to begin with: last.pt of another training, lidar.onnx, or shipped:kitti")

@@ -19,10 +19,12 @@ from lcf3d.detectors.resizing import resize_bilinear
 from lcf3d.errors import ConfigError, DetectorError
 from lcf3d.structures import FloatArray
 
-VOC_CLASSES = tuple(
-    "background aeroplane bicycle bird boat bottle bus car cat chair cow diningtable dog horse motorbike person "
-    "pottedplant sheep sofa train tvmonitor".split()
+# fmt: off
+VOC_CLASSES = (
+    "background", "aeroplane", "bicycle", "bird", "boat", "bottle", "bus", "car", "cat", "chair", "cow", "diningtable",
+    "dog", "horse", "motorbike", "person", "pottedplant", "sheep", "sofa", "train", "tvmonitor",
 )
+# fmt: on
 """Classes of torchvision's segmentation networks."""
 SEGMENTATION_MODELS = (
     "deeplabv3_mobilenet_v3_large",
@@ -266,7 +268,9 @@ def load_painter(text: str, class_names: Sequence[str]) -> Painter:
     known = set(inspect.signature(call).parameters) - {"argument", "class_names"}
     unknown = sorted(set(spec.settings) - known)
     if unknown:
-        raise ConfigError(f"painter {spec.kind!r} has no setting {unknown[0]!r}; its settings: {', '.join(sorted(known))}")
+        raise ConfigError(
+            f"painter {spec.kind!r} has no setting {unknown[0]!r}; its settings: {', '.join(sorted(known))}"
+        )
     return call(spec.argument, tuple(class_names), **spec.settings)
 
 
