@@ -225,7 +225,8 @@ def cost(options: argparse.Namespace) -> None:
     frames = [altered(dataset.frame(i), "clean") for i in dataset.ids[:10]]
     for frame in frames:
         # reading files belongs to no system
-        assert frame.images["left"] is not None and frame.points is not None
+        assert frame.images["left"] is not None
+        assert frame.points is not None
     fitted = learned(options, system)
     lidar, camera = lidar_branch(system.lidar), camera_branch() if system.build is not None else None
     fuse = system.build(fitted) if system.build is not None else None

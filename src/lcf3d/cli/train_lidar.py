@@ -79,10 +79,10 @@ def lidar(
         torch.set_num_threads(threads)
     recipe = SampleRecipe("lidar", preset, frames, samples_seed, density=density)
     config, painter = _painting(paint, frustums, dataset)
+    start, begin = _beginning(init)
     scans = _scans(dataset, split, version, recipe, samples, jobs, painter)
     learned, measured = scans.hold_out(held_out_of(scans.count, held_out, 100))
     objects = objects_of(learned, config)
-    start, begin = _beginning(init)
     task = LidarTask(
         learned,
         measured.part(0, VALIDATED),

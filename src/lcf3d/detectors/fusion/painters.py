@@ -189,13 +189,15 @@ def onnx_painter(
         raise ConfigError("a segmentation network needs its classes in order: onnx:FILE?classes=road,car,person,...")
     if normalize not in ("imagenet", "none"):
         raise ConfigError(f"normalize takes imagenet or none, got {normalize!r}")
+    # a single number is read as one
+    asked = _size(str(size))
     session = open_session(Path(argument), threads, "a segmentation network")
     inputs = session.get_inputs()
     shape = inputs[0].shape if len(inputs) == 1 else ()
     if len(shape) != 4 or shape[1] != 3:
         raise DetectorError(f"{argument} takes {[i.shape for i in inputs]}, expected one image of shape (1, 3, H, W)")
     fixed = tuple(side for side in shape[2:] if isinstance(side, int))
-    wanted = (fixed[0], fixed[1]) if len(fixed) == 2 else _size(size)
+    wanted = (fixed[0], fixed[1]) if len(fixed) == 2 else asked
 
     def segment(image: NDArray[np.float32]) -> NDArray[Any]:
         output = np.asarray(session.run(None, {inputs[0].name: image})[0])[0]
