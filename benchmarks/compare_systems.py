@@ -90,6 +90,7 @@ def systems(painted: Path | None, plain: Path | None, frustum: Path | None) -> l
         System("the same, probabilistic ensemble", OFF, cascade(bounded, "network")),
         System(DEFAULT, OFF, cascade(kitti)),
         System("ours, network localizer", OFF, cascade(kitti, "network")),
+        System("ours, no recovery", OFF, cascade(kitti.updated(recovery=False))),
         System("ours, ensemble=product", OFF, cascade(kitti.updated(ensemble="product"))),
         System("ours, calibrated", OFF, cascade(kitti, calibrated=True), "calibration"),
         System("CLOCs", KEEP, lambda fitted: fitted, "clocs"),
