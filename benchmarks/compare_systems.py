@@ -101,7 +101,6 @@ def systems(painted: Path | None, plain: Path | None, frustum: Path | None) -> l
         every.append(System("LiDAR alone, trained on", f"onnx-lidar:{plain}?nms=keep"))
     if painted is not None:
         every.append(System("PointPainting", f"painted:{painted}?nms=keep&without_image=unpainted"))
-        every.append(System("PointPainting, then ours", f"painted:{painted}?without_image=unpainted", cascade(kitti)))
     if frustum is not None:
         every.append(System("Frustum PointPillars", f"frustum-pillars:{frustum}?nms=keep&without_image=unpainted"))
     return every
@@ -122,22 +121,32 @@ class Branches:
         self.frames = list(frames)
         self.scans = {} if scans is None else scans
         self.images = {} if images is None else images
+        self.seconds: dict[str, float] = {}
 
     def lidar(self, spec: str) -> list[Detections3D]:
         """By the LiDAR branch that ``spec`` names."""
         # a painted network sees the image too
         kept = self.scans if spec.startswith(("shipped:", "onnx-lidar:")) else {}
         if spec not in kept:
-            run = lidar_branch(spec)
-            kept[spec] = [run(frame) for frame in self.frames]
+            kept[spec], self.seconds[spec] = timed(lidar_branch(spec), [(frame,) for frame in self.frames])
         return kept[spec]
 
     def camera(self) -> list[dict[str, Detections2D]]:
         """By the camera branch; a frame without an image has none."""
         if CAMERA not in self.images:
-            run = camera_branch()
-            self.images[CAMERA] = [run(frame) for frame in self.frames]
+            frames = [(frame,) for frame in self.frames]
+            self.images[CAMERA], self.seconds["camera"] = timed(camera_branch(), frames)
         return self.images[CAMERA]
+
+
+def timed(call: Callable[..., Any], inputs: Sequence[tuple[Any, ...]]) -> tuple[list[Any], float]:
+    """What a call gives, input by input, and the median of its processor seconds."""
+    results, seconds = [], []
+    for one in inputs:
+        start = time.process_time()
+        results.append(call(*one))
+        seconds.append(time.process_time() - start)
+    return results, median(seconds)
 
 
 def lidar_branch(spec: str) -> Callable[[Frame], Detections3D]:
@@ -201,13 +210,14 @@ def learned(options: argparse.Namespace, system: System) -> Any:
     return kind.load(path)
 
 
-def fused(system: System, branches: Branches, fitted: Any) -> list[Detections3D]:
-    """What a system finds on all frames."""
+def fused(system: System, branches: Branches, fitted: Any) -> tuple[list[Detections3D], float | None]:
+    """What a system finds on all frames, and processor seconds a frame of branches and fusion, if all were run now."""
     lidar = branches.lidar(system.lidar)
     if system.build is None:
-        return lidar
-    fuse = system.build(fitted)
-    return [fuse(*item) for item in zip(branches.frames, lidar, branches.camera(), strict=True)]
+        return lidar, branches.seconds.get(system.lidar)
+    found, seconds = timed(system.build(fitted), list(zip(branches.frames, lidar, branches.camera(), strict=True)))
+    parts = [branches.seconds.get(name) for name in (system.lidar, "camera")]
+    return found, None if None in parts else seconds + sum(part for part in parts if part is not None)
 
 
 def measured(evaluation: KittiEvaluation, found: Sequence[Detections3D], samples: int) -> dict[str, Any]:
@@ -219,36 +229,22 @@ def measured(evaluation: KittiEvaluation, found: Sequence[Detections3D], samples
     return {"drawn": {name: aps.tolist() for name, aps in drawn.items()}, "error": error}
 
 
-def cost(options: argparse.Namespace) -> None:
-    """Print processor seconds a frame and the highest memory of one system, in this process alone."""
-    system = next(s for s in systems(options.painted, options.plain, options.frustum) if s.name == options.cost_of)
+def print_memory(options: argparse.Namespace) -> None:
+    """Print the highest memory in MiB of one system on three frames, in this process alone."""
+    system = next(s for s in systems(options.painted, options.plain, options.frustum) if s.name == options.memory_of)
     dataset = KittiDataset(options.simulated)
-    frames = [altered(dataset.frame(i), "clean") for i in dataset.ids[:10]]
-    for frame in frames:
-        # reading files belongs to no system
-        assert frame.images["left"] is not None
-        assert frame.points is not None
-    fitted = learned(options, system)
-    lidar, camera = lidar_branch(system.lidar), camera_branch() if system.build is not None else None
-    fuse = system.build(fitted) if system.build is not None else None
-    seconds = []
-    for frame in frames:
-        start = time.process_time()
-        found = lidar(frame)
-        if fuse is not None and camera is not None:
-            fuse(frame, found, camera(frame))
-        seconds.append(time.process_time() - start)
-    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    print(json.dumps({"seconds": median(seconds[3:]), "memory": memory}))
+    branches = Branches([altered(dataset.frame(i), "clean") for i in dataset.ids[:3]])
+    fused(system, branches, learned(options, system))
+    print(json.dumps(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024))
 
 
-def costs(options: argparse.Namespace, name: str) -> dict[str, float]:
+def memory_of(name: str) -> float:
     """The same from a process of its own."""
-    command = [sys.executable, __file__, *sys.argv[1:], "--cost-of", name]
+    command = [sys.executable, __file__, *sys.argv[1:], "--memory-of", name]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
         raise SystemExit(f"error: {name} failed: {done.stderr.strip().splitlines()[-1]}")
-    return json.loads(done.stdout.splitlines()[-1])
+    return float(json.loads(done.stdout.splitlines()[-1]))
 
 
 def measure_all(options: argparse.Namespace) -> dict[str, Any]:
@@ -270,13 +266,16 @@ def measure_all(options: argparse.Namespace) -> dict[str, Any]:
         branches = Branches(frames, shared.setdefault(f"scans {scans}", {}), shared.setdefault(f"images {images}", {}))
         for system in missing:
             fitted = learned(options, system)
-            result = measured(evaluation, fused(system, branches, fitted), options.samples)
+            found, seconds = fused(system, branches, fitted)
+            result = measured(evaluation, found, options.samples)
+            if seconds is not None:
+                result["seconds"] = seconds
             kept.setdefault(system.name, {})[condition] = result
             write_json(path, kept)
             print(f"{condition}: {system.name}", file=sys.stderr, flush=True)
     for system in every:
-        if "cost" not in kept[system.name] and not options.no_cost:
-            kept[system.name]["cost"] = costs(options, system.name)
+        if options.memory and "memory" not in kept[system.name]:
+            kept[system.name]["memory"] = memory_of(system.name)
             write_json(path, kept)
     return {system.name: kept[system.name] for system in every}
 
@@ -300,8 +299,9 @@ def tables(kept: dict[str, Any]) -> str:
         aps = " | ".join(interval(own["clean"]["drawn"][c]) for c in KITTI_CLASSES)
         error = own["clean"]["error"]
         shown = "-" if error is None or not np.isfinite(error) else f"{100 * error:.1f} %"
-        spent = own.get("cost")
-        cells = f"{spent['seconds']:.2f} | {spent['memory']:.0f}" if spent else "- | -"
+        spent = [own[c]["seconds"] for c in CONDITIONS if "seconds" in own.get(c, {})]
+        cells = f"{spent[0]:.2f}" if spent else "-"
+        cells += f" | {own['memory']:.0f}" if "memory" in own else " | -"
         lines.append(f"| {name} | {aps} | {shown} | {cells} |")
     lines += ["", f"| minus {DEFAULT} | {classes} | mean |", "|---|" + "---|" * 4]
     base = kept[DEFAULT]["clean"]
@@ -334,14 +334,14 @@ def main() -> None:
         parser.add_argument(f"--{name}", type=Path, help=f"{name} network of lcf3d train lidar")
     parser.add_argument("--real", type=Path, help="folder of kitti and kitti_tracking with result files")
     parser.add_argument("--samples", type=int, default=200, help="draws of frames for the intervals")
-    parser.add_argument("--no-cost", action="store_true", help="neither time nor memory")
+    parser.add_argument("--memory", action="store_true", help="also the memory of each, in processes of their own")
     parser.add_argument("--out", type=Path, default=Path("comparison"))
-    parser.add_argument("--cost-of", help=argparse.SUPPRESS)
+    parser.add_argument("--memory-of", help=argparse.SUPPRESS)
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     try:
-        if options.cost_of:
-            cost(options)
+        if options.memory_of:
+            print_memory(options)
             return
         text = tables(measure_all(options))
         (options.out / "comparison.md").write_text(text, encoding="utf-8")

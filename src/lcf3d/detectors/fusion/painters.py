@@ -196,12 +196,13 @@ def onnx_painter(
     shape = inputs[0].shape if len(inputs) == 1 else ()
     if len(shape) != 4 or shape[1] != 3:
         raise DetectorError(f"{argument} takes {[i.shape for i in inputs]}, expected one image of shape (1, 3, H, W)")
-    fixed = tuple(side for side in shape[2:] if isinstance(side, int))
+    fixed = [side for side in shape[2:] if isinstance(side, int)]
     wanted = (fixed[0], fixed[1]) if len(fixed) == 2 else asked
 
     def segment(image: NDArray[np.float32]) -> NDArray[Any]:
         output = np.asarray(session.run(None, {inputs[0].name: image})[0])[0]
-        return output[0] if output.ndim == 3 and len(output) == 1 else output
+        map_of_classes: NDArray[Any] = output[0] if output.ndim == 3 and len(output) == 1 else output
+        return map_of_classes
 
     return SegmentationPainter(segment, read_class_names(classes), class_names, wanted, normalize == "imagenet")
 
