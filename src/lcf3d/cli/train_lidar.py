@@ -42,10 +42,12 @@ def lidar(
     learning_rate: Annotated[float, typer.Option(help="highest one of the schedule")] = 3e-3,
     tilt: Annotated[float, typer.Option(min=0, help="degrees that scans are tilted by at most")] = 0.0,
     paint: Annotated[
-        str, typer.Option(help="PointPainting: what gives points class scores, masks:shipped:kitti, onnx:FILE?classes=..")
+        str,
+        typer.Option(help="PointPainting: what gives points class scores, for example masks:shipped:kitti"),
     ] = "",
     frustums: Annotated[
-        str, typer.Option(help="Frustum PointPillars: camera detector whose boxes cut frustums, for example shipped:kitti")
+        str,
+        typer.Option(help="Frustum PointPillars: whose boxes cut frustums, for example shipped:kitti"),
     ] = "",
     init: Annotated[
         str, typer.Option(help="weights to begin with: last.pt of another training, lidar.onnx, or shipped:kitti")
@@ -77,10 +79,10 @@ def lidar(
         torch.set_num_threads(threads)
     recipe = SampleRecipe("lidar", preset, frames, samples_seed, density=density)
     config, painter = _painting(paint, frustums, dataset)
+    start, begin = _beginning(init)
     scans = _scans(dataset, split, version, recipe, samples, jobs, painter)
     learned, measured = scans.hold_out(held_out_of(scans.count, held_out, 100))
     objects = objects_of(learned, config)
-    start, begin = _beginning(init)
     task = LidarTask(
         learned,
         measured.part(0, VALIDATED),

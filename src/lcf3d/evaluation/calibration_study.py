@@ -69,6 +69,20 @@ class ClassReport:
     after: tuple[float, ...]
 
 
+class FusedScores(NamedTuple):
+    """Scores of all LiDAR detections, each fused by what was fitted on the other folds; NaN for those left out.
+
+    Attributes:
+        equivalents: (N,) on the scale of the LiDAR detector's own scores, comparable between folds.
+        probabilities: (N,) that the box is right.
+        alone: (N,) the same by the LiDAR score alone.
+    """
+
+    equivalents: FloatArray
+    probabilities: FloatArray
+    alone: FloatArray
+
+
 class CalibrationStudy:
     """Detections of two branches and the ground truth of the same frames.
 
@@ -161,7 +175,12 @@ class CalibrationStudy:
         return joined, np.concatenate(places).astype(np.int64)
 
     def cross_validate(self, final: Calibration) -> list[ClassReport]:
-        """Fit on all folds but one, fuse the one, for each; then judge all frames together.
+        """Fit on all folds but one, fuse the one, for each; then judge all frames together."""
+        scores = self.fuse_folds(final)
+        return [self._report(name, *scores) for name in self._present_classes()]
+
+    def fuse_folds(self, final: Calibration) -> FusedScores:
+        """The scores of every fold, fused by what was fitted on the others.
 
         Each fold's model is only defined up to a rising map, so fused log-odds are written in the LiDAR detector's own
         score before folds are put together: within a fold the order is the model's.
@@ -184,7 +203,7 @@ class CalibrationStudy:
                 level = np.where(judged, (fused - evidence.base) / evidence.trust, log_odds)
                 score_map = model.lidar.get(name)
                 equivalents[rows] = score_map.transformed_at(level) if score_map else level
-        return [self._report(name, equivalents, probabilities, alone) for name in self._present_classes()]
+        return FusedScores(equivalents, probabilities, alone)
 
     def rescored(self, scores: FloatArray) -> list[Detections3D]:
         """The LiDAR boxes with other scores, those of NaN left out."""

@@ -19,10 +19,12 @@ from lcf3d.detectors.resizing import resize_bilinear
 from lcf3d.errors import ConfigError, DetectorError
 from lcf3d.structures import FloatArray
 
-VOC_CLASSES = tuple(
-    "background aeroplane bicycle bird boat bottle bus car cat chair cow diningtable dog horse motorbike person "
-    "pottedplant sheep sofa train tvmonitor".split()
+# fmt: off
+VOC_CLASSES = (
+    "background", "aeroplane", "bicycle", "bird", "boat", "bottle", "bus", "car", "cat", "chair", "cow", "diningtable",
+    "dog", "horse", "motorbike", "person", "pottedplant", "sheep", "sofa", "train", "tvmonitor",
 )
+# fmt: on
 """Classes of torchvision's segmentation networks."""
 SEGMENTATION_MODELS = (
     "deeplabv3_mobilenet_v3_large",
@@ -187,17 +189,20 @@ def onnx_painter(
         raise ConfigError("a segmentation network needs its classes in order: onnx:FILE?classes=road,car,person,...")
     if normalize not in ("imagenet", "none"):
         raise ConfigError(f"normalize takes imagenet or none, got {normalize!r}")
+    # a single number is read as one
+    asked = _size(str(size))
     session = open_session(Path(argument), threads, "a segmentation network")
     inputs = session.get_inputs()
     shape = inputs[0].shape if len(inputs) == 1 else ()
     if len(shape) != 4 or shape[1] != 3:
         raise DetectorError(f"{argument} takes {[i.shape for i in inputs]}, expected one image of shape (1, 3, H, W)")
-    fixed = tuple(side for side in shape[2:] if isinstance(side, int))
-    wanted = (fixed[0], fixed[1]) if len(fixed) == 2 else _size(size)
+    fixed = [side for side in shape[2:] if isinstance(side, int)]
+    wanted = (fixed[0], fixed[1]) if len(fixed) == 2 else asked
 
     def segment(image: NDArray[np.float32]) -> NDArray[Any]:
         output = np.asarray(session.run(None, {inputs[0].name: image})[0])[0]
-        return output[0] if output.ndim == 3 and len(output) == 1 else output
+        map_of_classes: NDArray[Any] = output[0] if output.ndim == 3 and len(output) == 1 else output
+        return map_of_classes
 
     return SegmentationPainter(segment, read_class_names(classes), class_names, wanted, normalize == "imagenet")
 
@@ -266,7 +271,9 @@ def load_painter(text: str, class_names: Sequence[str]) -> Painter:
     known = set(inspect.signature(call).parameters) - {"argument", "class_names"}
     unknown = sorted(set(spec.settings) - known)
     if unknown:
-        raise ConfigError(f"painter {spec.kind!r} has no setting {unknown[0]!r}; its settings: {', '.join(sorted(known))}")
+        raise ConfigError(
+            f"painter {spec.kind!r} has no setting {unknown[0]!r}; its settings: {', '.join(sorted(known))}"
+        )
     return call(spec.argument, tuple(class_names), **spec.settings)
 
 
