@@ -299,9 +299,7 @@ def speed(drives: Drives) -> None:
         for frame, fused in pairs:
             memory, _ = remember(memory, fused, frame, config)
         times.append((process_time() - before) / len(pairs) * 1e3)
-    print(
-        f"\n## Speed\n\n{np.median(times):.2f} ms of the processor a frame with {count} objects (least {min(times):.2f})"
-    )
+    print(f"\n## Speed\n\n{count} objects: {np.median(times):.2f} ms of the processor a frame (least {min(times):.2f})")
 
 
 QUESTIONS = {
