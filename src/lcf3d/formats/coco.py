@@ -103,7 +103,9 @@ def pack_counts(runs: Sequence[int]) -> str:
     return "".join(characters)
 
 
-def read_camera_detections(path: str | Path, class_names: Sequence[str], left_out: LeftOut | None = None) -> CameraDetections:
+def read_camera_detections(
+    path: str | Path, class_names: Sequence[str], left_out: LeftOut | None = None
+) -> CameraDetections:
     """Detections of a simple list (see the module's text) by (sample token, camera), with masks where there are some.
 
     Classes that are none of ``class_names`` (`lcf3d.detectors.joins`) are left out and counted in ``left_out``.
@@ -251,7 +253,7 @@ def _records(path: str | Path) -> list[dict[str, Any]]:
 
 
 def _group(
-    path: Path, records: list[dict[str, Any]], key: Any, class_names: Sequence[str], left_out: LeftOut | None
+    path: str | Path, records: list[dict[str, Any]], key: Any, class_names: Sequence[str], left_out: LeftOut | None
 ) -> CameraDetections:
     """Detections of ``records`` by ``key``."""
     names = tuple(class_names)
