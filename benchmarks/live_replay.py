@@ -166,6 +166,7 @@ class Clock:
         self.wall: list[float] = []
 
     def __call__(self, result: LiveResult) -> None:
+        """A result has come."""
         self.cpu.append((time.thread_time() - self.pushed) * 1e3)
         self.wall.append(result.latency_ms["added"])
 

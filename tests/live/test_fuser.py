@@ -155,6 +155,21 @@ def test_detectors_run_on_scans_and_images_in_order():
     assert results[0].frame.images["left"] is pixels
 
 
+def test_images_without_a_detector_are_told_and_pixels_beside_boxes_are_shown():
+    view, pixels = camera(), np.zeros((400, 1000, 3), np.uint8)
+    target = fuser()
+    boxes = boxes2d(view, street(0))
+    messages = [
+        LidarBoxes(0.0, boxes3d(street(0))),
+        Image(0.0, "left", pixels),
+        CameraBoxes(0.01, "left", boxes, pixels),
+    ]
+    (result,) = run(target, messages)
+    assert result.frame.images["left"] is pixels
+    assert result.fused.camera_names == ("left",)
+    assert "there is no detector" in value(target, "fusion", "notes")
+
+
 def test_a_detector_that_raises_is_reported_and_the_rest_goes_on():
     def broken(images):
         raise RuntimeError("no memory")

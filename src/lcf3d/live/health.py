@@ -186,7 +186,12 @@ class Health:
         return entries + [self._of_camera(name, sync, reports.get(name), hanging) for name in cameras]
 
     def _of_fusion(self, sync: Synchronizer) -> dict[str, Any]:
-        problems = [f"{self.errors['fusion']} frames could not be fused"] if self.errors["fusion"] else []
+        stages = {
+            "fusion": "frames could not be fused",
+            "memory": "frames went without memory",
+            "watch": "moments the watch failed at",
+        }
+        problems = [f"{self.errors[stage]} {what}" for stage, what in stages.items() if self.errors[stage]]
         values = {
             "frames": self.frames,
             "pending": sync.pending,
@@ -194,7 +199,7 @@ class Health:
             "latency_added_ms_median": self.percentile("added", 50),
             "latency_added_ms_p99": self.percentile("added", 99),
             "notes": "; ".join(self.notes),
-            "last_error": self.last_error.get("fusion", ""),
+            "last_error": "; ".join(self.last_error[stage] for stage in stages if stage in self.last_error),
         }
         return _entry("fusion", ERROR if problems else OK, problems, values)
 

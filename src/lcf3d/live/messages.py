@@ -37,11 +37,12 @@ class Image:
 
 @dataclass(frozen=True, eq=False)
 class CameraBoxes:
-    """2D detections of one camera at ``time``, that of their image."""
+    """2D detections of one camera at ``time``, that of their image; ``pixels`` are for those who look at the result."""
 
     time: float
     camera: str
     detections: Detections2D
+    pixels: NDArray[np.uint8] | None = None
 
 
 @dataclass(frozen=True, eq=False)

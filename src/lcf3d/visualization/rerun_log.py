@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -10,15 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lcf3d.errors import MissingExtraError
-from lcf3d.geometry.rotation import quaternions_from_yaws
+from lcf3d.geometry.rotation import invert_rigid, quaternions_from_yaws, transform_points
 from lcf3d.provenance import FusedDetections
 from lcf3d.structures import Camera, Detections3D, FloatArray, Frame
-from lcf3d.visualization.scene import CAMERA_COLOUR, COLOURS, TRUTH_COLOUR, Scene
+from lcf3d.visualization.scene import CAMERA_COLOUR, COLOURS, TRUTH_COLOUR, Scene, drawn_dropped
 
 _GREY = (110, 115, 120)
 # scans and images of more than this are thinned, so that a recording of a drive stays small
 MOST_POINTS = 60_000
 JPEG_QUALITY = 80
+# places of a track that its trail shows
+TRAIL = 50
 
 
 class RerunLog:
@@ -27,12 +30,13 @@ class RerunLog:
     Args:
         path: the ``.rrd`` file; without one the viewer is opened.
         cameras: names of the cameras, for the layout.
+        stream: whether latency, alignment and health come with the frames and get a place in the layout.
 
     Raises:
         MissingExtraError: rerun-sdk is not installed.
     """
 
-    def __init__(self, path: Path | None, cameras: Sequence[str]) -> None:
+    def __init__(self, path: Path | None, cameras: Sequence[str], *, stream: bool = False) -> None:
         try:
             import rerun
             import rerun.blueprint
@@ -45,9 +49,11 @@ class RerunLog:
         else:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._stream.save(path)
-        self._stream.send_blueprint(_blueprint(rerun.blueprint, cameras))
+        self._stream.send_blueprint(_blueprint(rerun.blueprint, cameras, stream))
         self._stream.log("world", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         self._index = 0
+        self._trails: dict[int, deque[FloatArray]] = {}
+        self._messages: dict[str, str] = {}
 
     def log(
         self,
@@ -57,8 +63,12 @@ class RerunLog:
         truth: Detections3D | None = None,
         latency_ms: Mapping[str, float] | None = None,
         alignment_deg: Mapping[str, float] | None = None,
+        health: Sequence[Mapping[str, Any]] = (),
     ) -> None:
         """One frame: cameras with images and boxes, the scan coloured by what was decided, boxes with their reasons.
+
+        Where the boxes have tracks, each has the way that it came: over ground if the frame has a pose, else as the
+        LiDAR saw it.
 
         Args:
             frame: the frame.
@@ -66,20 +76,26 @@ class RerunLog:
             truth: ground truth to draw, if any.
             latency_ms: milliseconds by stage, for the timeline.
             alignment_deg: how far each camera has turned against its calibration, by name, for the timeline.
+            health: of a stream, as `lcf3d.live.fuser.Fuser.diagnostics` gives it.
         """
         scene = Scene.from_fused(fused, truth)
         self._stream.set_time("frame", sequence=self._index)
         if frame.timestamp is not None:
             self._stream.set_time("time", duration=frame.timestamp)
         self._index += 1
-        self._log_boxes("world/boxes", scene.boxes, [COLOURS[o] for o in scene.outcomes], scene.texts)
+        reasons = [fused.explain(i) for i in range(len(fused))]
+        reasons += [fused.explain_lidar(int(i)) for i in drawn_dropped(fused)]
+        self._log_boxes("world/boxes", scene.boxes, [COLOURS[o] for o in scene.outcomes], reasons)
+        self._log_trails(frame, fused, scene)
         if scene.truth is not None:
             self._log_boxes("world/truth", scene.truth, [TRUTH_COLOUR] * len(scene.truth), ())
         self._log_points(frame.points, scene)
         for camera in frame.cameras:
             self._log_camera(camera, frame, scene)
         self._log_masks(frame, fused)
-        self._log_texts_and_curves(fused, latency_ms or {}, alignment_deg or {})
+        self._log_reasons(fused, reasons[: len(fused)])
+        self._log_curves(fused, scene, latency_ms or {}, alignment_deg or {})
+        self._log_health(health)
 
     def close(self) -> None:
         """Write what is not yet written."""
@@ -154,17 +170,56 @@ class RerunLog:
                     part[mask.bitmap[: part.shape[0], : part.shape[1]]] = number % 255 + 1
             self._stream.log(f"world/cameras/{name}/image/masks", self._rerun.SegmentationImage(picture, opacity=0.4))
 
-    def _log_texts_and_curves(
-        self, fused: FusedDetections, latency_ms: Mapping[str, float], alignment_deg: Mapping[str, float]
-    ) -> None:
-        lines = [f"- {fused.explain(i)}" for i in range(len(fused))] + [f"- *{note}*" for note in fused.notes]
+    def _log_trails(self, frame: Frame, fused: FusedDetections, scene: Scene) -> None:
+        """The latest `TRAIL` places of every track of this frame, in the frame's coordinates."""
+        if fused.tracks is None:
+            return
+        world = np.eye(4) if frame.world_from_lidar is None else frame.world_from_lidar
+        ids = [int(number) for number in fused.tracks.ids]
+        self._trails = {number: self._trails.get(number, deque(maxlen=TRAIL)) for number in ids}
+        for number, place in zip(ids, transform_points(fused.detections.boxes[:, :3], world), strict=True):
+            self._trails[number].append(place)
+        back = invert_rigid(world)
+        strips = [transform_points(np.array(self._trails[number]), back) for number in ids]
+        colours = np.array([COLOURS[outcome] for outcome in scene.outcomes[: len(ids)]], dtype=np.uint8)
+        labels = [f"track {number}" for number in ids]
+        self._stream.log(
+            "world/trails",
+            self._rerun.LineStrips3D(strips, colors=colours.reshape(-1, 3), labels=labels or None, show_labels=False),
+        )
+
+    def _log_reasons(self, fused: FusedDetections, reasons: Sequence[str]) -> None:
+        lines = [f"- {reason}" for reason in reasons] + [f"- *{note}*" for note in fused.notes]
         self._stream.log("reasons", self._rerun.TextDocument("\n".join(lines) or "nothing", media_type="text/markdown"))
+
+    def _log_curves(
+        self, fused: FusedDetections, scene: Scene, latency_ms: Mapping[str, float], alignment_deg: Mapping[str, float]
+    ) -> None:
         scores = fused.detections.scores
-        curves = {"scores/highest": float(scores.max()) if len(scores) else 0.0, "scores/boxes": float(len(scores))}
+        curves = {"scores/highest": float(scores.max()) if len(scores) else 0.0}
+        curves["scores/median"] = float(np.median(scores)) if len(scores) else 0.0
+        # every outcome at every frame: a curve that stops would look as if it went on
+        curves |= {f"boxes/{outcome}": float(scene.outcomes.count(outcome)) for outcome in COLOURS}
         curves |= {f"latency/{part}": value for part, value in latency_ms.items()}
         curves |= {f"alignment/{camera}": value for camera, value in alignment_deg.items()}
         for entity, value in curves.items():
             self._stream.log(entity, self._rerun.Scalars(value))
+
+    def _log_health(self, health: Sequence[Mapping[str, Any]]) -> None:
+        """Level of every part (0 ok, 1 warning, 2 error, 3 silent) and shares of confirmed boxes as curves; a line of
+        text where what is said of a part changes."""
+        levels = ("INFO", "WARN", "ERROR", "ERROR")
+        for status in health:
+            part = str(status["hardware_id"]).removeprefix("camera ")
+            self._stream.log(f"health/{part}", self._rerun.Scalars(float(status["level"])))
+            values = {entry["key"]: entry["value"] for entry in status["values"]}
+            share = float(values.get("confirmed_share", "nan"))
+            if np.isfinite(share):
+                self._stream.log(f"confirmed/{part}", self._rerun.Scalars(share))
+            if self._messages.get(part) != status["message"]:
+                self._messages[part] = status["message"]
+                line = self._rerun.TextLog(f"{part}: {status['message']}", level=levels[status["level"]])
+                self._stream.log("events", line)
 
 
 def point_colours(points: NDArray[np.float32], scene: Scene) -> NDArray[np.uint8]:
@@ -180,21 +235,22 @@ def point_colours(points: NDArray[np.float32], scene: Scene) -> NDArray[np.uint8
     return colours
 
 
-def _blueprint(blueprint: Any, cameras: Sequence[str]) -> Any:
-    """Scan and boxes beside the reasons; cameras below; curves of scores, latency and alignment at the bottom."""
+def _blueprint(blueprint: Any, cameras: Sequence[str], stream: bool) -> Any:
+    """Scan and boxes beside the reasons; cameras below; curves at the bottom, of a stream beside what happened."""
     views = [
         blueprint.Spatial2DView(origin=f"world/cameras/{name}/image", name=name, contents="$origin/**")
         for name in cameras
     ]
-    curves = [
-        blueprint.TimeSeriesView(origin=name, name=name.capitalize()) for name in ("scores", "latency", "alignment")
-    ]
+    names = ["scores", "boxes", *(["latency", "alignment", "health", "confirmed"] if stream else [])]
+    curves = [blueprint.TimeSeriesView(origin=name, name=name.capitalize()) for name in names]
+    reasons = blueprint.TextDocumentView(origin="reasons", name="Reasons")
+    beside = (
+        [blueprint.Vertical(reasons, blueprint.TextLogView(origin="events", name="Health"))] if stream else [reasons]
+    )
     return blueprint.Blueprint(
         blueprint.Vertical(
             blueprint.Horizontal(
-                blueprint.Spatial3DView(origin="world", name="Scan and boxes"),
-                blueprint.TextDocumentView(origin="reasons", name="Reasons"),
-                column_shares=[3, 1],
+                blueprint.Spatial3DView(origin="world", name="Scan and boxes"), *beside, column_shares=[3, 1]
             ),
             *([blueprint.Horizontal(*views)] if views else []),
             blueprint.Horizontal(*curves),

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from lcf3d.provenance import FusedDetections, Outcome, Reason
-from lcf3d.structures import BoolArray, Detections2D, Detections3D, FloatArray
+from lcf3d.structures import BoolArray, Detections2D, Detections3D, FloatArray, IntArray
 from lcf3d.visualization.canvas import Colour
 
 # Okabe and Ito's colours, told apart with any colour vision; order of the legend and, backwards, of drawing
@@ -17,6 +17,7 @@ COLOURS: Mapping[str, Colour] = {
     "recovered": (240, 160, 0),
     "kept": (86, 180, 233),
     "downweighted": (214, 130, 178),
+    "predicted": (213, 94, 0),
     "detection": (86, 180, 233),
     "dropped": (190, 190, 190),
 }
@@ -104,8 +105,7 @@ class Scene:
         lowered = fused.lidar.output[fused.lidar.reason == Reason.DOWNWEIGHTED]
         for output in lowered[lowered >= 0]:
             outcomes[output] = "downweighted"
-        dropped = fused.dropped_lidar
-        dropped = dropped[~np.isin(fused.lidar.reason[dropped], _NOT_DRAWN)]
+        dropped = drawn_dropped(fused)
         dropped = dropped[fused.lidar_inputs.scores[dropped] >= least_score]
         shown = np.flatnonzero(fused.detections.scores >= least_score)
         return cls(
@@ -115,6 +115,12 @@ class Scene:
             _image_boxes(fused, least_score),
             None if truth is None else truth.boxes,
         )
+
+
+def drawn_dropped(fused: FusedDetections) -> IntArray:
+    """Indices of the LiDAR detections that were candidates and were dropped; they are drawn after the outputs."""
+    dropped = fused.dropped_lidar
+    return dropped[~np.isin(fused.lidar.reason[dropped], _NOT_DRAWN)]
 
 
 def _image_boxes(fused: FusedDetections, least_score: float) -> dict[str, ImageBoxes]:
