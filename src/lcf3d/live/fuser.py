@@ -26,6 +26,7 @@ from lcf3d.live.messages import (
     LidarBoxes,
     Message,
     Scan,
+    is_whole,
     same_mount,
     source_of,
 )
@@ -35,7 +36,7 @@ from lcf3d.live.warming import warm_up
 from lcf3d.live.watching import WatchFeed
 from lcf3d.live.workers import Worker, attempt
 from lcf3d.provenance import FusedDetections
-from lcf3d.structures import Camera, Frame
+from lcf3d.structures import Camera, Detections2D, Detections3D, Frame
 
 
 @dataclass(frozen=True)
@@ -204,14 +205,18 @@ class Fuser:
             return
         if isinstance(message, Image | CameraBoxes) and message.camera not in self._models:
             self.health.tell_once(f"camera {message.camera} has no calibration yet: its messages wait for one")
+        if not is_whole(message):
+            self._sync.dropped[source, "broken"] += 1
+            return
         self.health.saw(source, message, arrival)
-        if not self._sync.admit(source, message.time):
+        restarts = self._sync.restarts
+        admitted = self._sync.admit(source, message.time)
+        if self._sync.restarts > restarts:
+            self._begin_anew()
+        if not admitted:
             return
         if isinstance(message, EgoPose):
-            if np.shape(message.world_from_lidar) == (4, 4) and np.isfinite(message.world_from_lidar).all():
-                self._poses.add(message.time, message.world_from_lidar)
-            else:
-                self._sync.dropped[source, "broken"] += 1
+            self._poses.add(message.time, message.world_from_lidar)
             return
         if isinstance(message, Scan):
             self._sync.add_scan(message.time, message.points, arrival)
@@ -223,6 +228,13 @@ class Fuser:
             self._sync.add_camera(message.camera, CameraPart(message.time, message.detections, message.pixels, arrival))
         elif isinstance(message, Image):
             self.health.tell_once(f"camera {message.camera} sends images, but there is no detector for them")
+
+    def _begin_anew(self) -> None:
+        """Time went back: poses are of another time, and the latest calibrations hold from now on."""
+        self.health.tell("time went back: everything began anew")
+        self._poses.clear()
+        for name, known in self._models.items():
+            self._models[name] = [(-np.inf, known[-1][1])]
 
     def _learn_camera(self, message: CameraModel) -> None:
         """A calibration that is new, or that changes in the middle.
@@ -274,6 +286,9 @@ class Fuser:
         self, source: str, message: Scan | Image, result: Any, error: Exception | None, spent: float, arrival: float
     ) -> None:
         """What a detector found, or that it failed."""
+        wanted = Detections3D if isinstance(message, Scan) else Detections2D
+        if error is None and not isinstance(result, wanted):
+            error = TypeError(f"it must give {wanted.__name__}, not {type(result).__name__}")
         if error is not None:
             self.health.failed(source, error)
             return
@@ -320,7 +335,9 @@ class Fuser:
         live = LiveResult(group.time, frame, result, latency)
         self._results.append(live)
         if self._on_result is not None:
-            self._on_result(live)
+            _, error = attempt(self._on_result, live)
+            if error is not None:
+                self.health.failed("callback", error)
         self._look_after(group, frame, nominal, result, latency)
 
     def _remember(self, frame: Frame, result: FusedDetections) -> FusedDetections:

@@ -73,6 +73,19 @@ def source_of(message: Message) -> str:
     return {Scan: "scan", LidarBoxes: "lidar", EgoPose: "pose"}[type(message)]
 
 
+def is_whole(message: Message) -> bool:
+    """Whether a message's data has the shape that it should: what was cut off on the way has not."""
+    if isinstance(message, Scan):
+        return np.ndim(message.points) == 2 and np.shape(message.points)[1] >= 3
+    if isinstance(message, Image):
+        return np.ndim(message.pixels) == 3 and np.shape(message.pixels)[2] == 3
+    if isinstance(message, EgoPose):
+        return np.shape(message.world_from_lidar) == (4, 4) and bool(np.isfinite(message.world_from_lidar).all())
+    if isinstance(message, LidarBoxes):
+        return isinstance(message.detections, Detections3D)
+    return not isinstance(message, CameraBoxes) or isinstance(message.detections, Detections2D)
+
+
 def same_mount(camera: Camera, other: Camera) -> bool:
     """Whether two calibrations are of one camera on a moving car: equal but for a turn by a degree or so."""
     turn = camera.camera_from_lidar[:3, :3].T @ other.camera_from_lidar[:3, :3]
