@@ -24,8 +24,9 @@ import numpy as np
 
 from lcf3d import Detections2D, Detections3D, FusionConfig, LateCascadeFusion
 from lcf3d.geometry.camera import project_boxes
-from lcf3d.live.fuser import Fuser, LiveResult, LiveSettings
+from lcf3d.live.fuser import Fuser
 from lcf3d.live.messages import CameraBoxes, EgoPose, LidarBoxes, Message
+from lcf3d.live.settings import LiveResult, LiveSettings
 from lcf3d.live.synchronizer import SyncSettings
 from lcf3d.simulation.presets import get_preset
 from lcf3d.structures import FloatArray

@@ -12,7 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from lcf3d.errors import ConfigError
-from lcf3d.live.fuser import Fuser, LiveResult
+from lcf3d.live.fuser import Fuser
+from lcf3d.live.settings import LiveResult
 from lcf3d.live.workers import Worker
 
 # seconds of the stream between two lines of health

@@ -13,8 +13,9 @@ from lcf3d.datasets.base import CameraSource, Dataset, LidarSource
 from lcf3d.fusion.alignment_watch import WatchSettings
 from lcf3d.fusion.memory_config import MemoryConfig
 from lcf3d.fusion.pipeline import LateCascadeFusion
-from lcf3d.live.fuser import Fuser, LiveResult, LiveSettings
+from lcf3d.live.fuser import Fuser
 from lcf3d.live.messages import CameraBoxes, CameraModel, EgoPose, Image, LidarBoxes, Message, Scan
+from lcf3d.live.settings import LiveResult, LiveSettings
 from lcf3d.live.synchronizer import SyncSettings
 from lcf3d.run.sources import CameraOnImages, LidarOnScans
 from lcf3d.structures import Camera, Frame
