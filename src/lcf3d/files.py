@@ -27,7 +27,7 @@ _SHOWN = 120
 
 
 @contextmanager
-def atomic_path(path: Path) -> Iterator[Path]:
+def atomic_path(path: str | Path) -> Iterator[Path]:
     """A temporary path beside ``path`` to write to; it takes the place of ``path`` when the block ends well.
 
     Its name begins with a dot and holds the process's number: no listing takes it for a finished file, and
@@ -36,11 +36,16 @@ def atomic_path(path: Path) -> Iterator[Path]:
     Raises:
         OSError: no place left, no permission ...; names ``path``.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f"{_TEMPORARY}.{os.getpid()}.{path.name}")
+    path = Path(path)
+    folder = path.parent
+    if not os.path.isdir(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+    temporary = folder / f"{_TEMPORARY}.{os.getpid()}.{path.name}"
+    moved = False
     try:
         yield temporary
         os.replace(temporary, path)
+        moved = True
     except OSError as error:
         # the file that was to be written, not the one that nobody knows
         if error.errno == errno.ENOSPC:
@@ -49,7 +54,8 @@ def atomic_path(path: Path) -> Iterator[Path]:
             raise OSError(error.errno, error.strerror, str(path)) from None
         raise
     finally:
-        temporary.unlink(missing_ok=True)
+        if not moved:
+            temporary.unlink(missing_ok=True)
 
 
 def is_hidden(path: Path) -> bool:
@@ -151,7 +157,7 @@ def largest_size() -> int:
         raise ConfigError(f"LCF3D_MAX_FILE_GB must be a number of gigabytes, got {shortened(text)!r}") from None
 
 
-def require_file(path: Path) -> None:
+def require_file(path: str | Path) -> None:
     """See that a path is a regular file of a size that real data has, without opening it.
 
     Raises:
@@ -175,7 +181,7 @@ def require_file(path: Path) -> None:
         )
 
 
-def read_bytes(path: Path) -> bytes:
+def read_bytes(path: str | Path) -> bytes:
     """The content of a file.
 
     Raises:
@@ -187,7 +193,7 @@ def read_bytes(path: Path) -> bytes:
         return file.read()
 
 
-def read_text(path: Path) -> str:
+def read_text(path: str | Path) -> str:
     """The text of a file in UTF-8, without a byte order mark.
 
     Raises:
@@ -200,18 +206,18 @@ def read_text(path: Path) -> str:
         raise FormatError(f"{path} is not a text file in UTF-8") from None
 
 
-def write_text(path: Path, text: str) -> None:
+def write_text(path: str | Path, text: str) -> None:
     """Write ``text`` to ``path``, whole or not at all."""
-    with atomic_path(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+    with atomic_path(path) as temporary, open(temporary, "wb") as file:
+        file.write(text.encode())
 
 
-def write_json(path: Path, value: Any, indent: int | None = 2) -> None:
+def write_json(path: str | Path, value: Any, indent: int | None = 2) -> None:
     """Write ``value`` as JSON to ``path``, whole or not at all."""
     write_text(path, json.dumps(value, indent=indent) + "\n")
 
 
-def read_json(path: Path) -> Any:
+def read_json(path: str | Path) -> Any:
     """The value in a JSON file.
 
     Raises:

@@ -280,7 +280,7 @@ def test_provenance_survives_json_and_follows_the_outputs():
     )[-1]
     back = FusedDetections.from_json(result.to_json())
     assert np.array_equal(back.tracks.ids, result.tracks.ids)
-    assert back.explain(1) == result.explain(1)
+    assert back.explanations() == [result.explain(0), result.explain(1)]
     # the LiDAR detection that led to each output is still the one whose box it has
     for row, output in enumerate(result.lidar.output):
         assert result.lidar_inputs.boxes[row][0] == pytest.approx(result.detections.boxes[output][0])

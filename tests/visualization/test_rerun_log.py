@@ -95,6 +95,7 @@ def test_tracks_have_trails_over_ground(tmp_path):
         log.log(moment, remembered)
     drawn = logged["world/trails"]
     assert len(drawn) == 4
+    assert len(drawn[0].strips.as_arrow_array()) == 0
     strips = np.array(drawn[-1].strips.as_arrow_array().to_pylist()[0])
     # the cars stand while we drive past: in the last frame's coordinates all four places are the same
     assert strips.shape == (4, 3)

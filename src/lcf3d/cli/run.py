@@ -40,7 +40,7 @@ def run(
     set_: Annotated[list[str] | None, typer.Option("--set", help="change a setting, name=value; repeatable")] = None,
     recovery: Annotated[str | None, typer.Option(help="on or off; off needs no scans")] = None,
     localizer: Annotated[
-        str, typer.Option(help="geometric, network, onnx:FILE or frustum-pointnet:CHECKPOINT")
+        str, typer.Option(help="geometric, network, combined, onnx:FILE or frustum-pointnet:CHECKPOINT")
     ] = "geometric",
     tiles: Annotated[
         int, typer.Option(min=1, help="overlapping tiles across wide images, for yolox: and onnx: detectors")

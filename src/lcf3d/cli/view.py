@@ -28,6 +28,9 @@ def view(
     truth: Annotated[bool, typer.Option(help="also draw the ground truth, thin and white")] = True,
     limit: Annotated[int | None, typer.Option(min=1, help="draw at most so many frames")] = None,
     min_score: Annotated[float, typer.Option(help="leave out boxes of a lower score")] = float("-inf"),
+    gif: Annotated[
+        Path | None, typer.Option(help="no pictures but one that moves: a .gif file, with the trails of tracks")
+    ] = None,
     rerun: Annotated[
         str | None,
         typer.Option(help="no pictures but a Rerun recording: a .rrd file, or viewer to open it (run folders)"),
@@ -43,12 +46,14 @@ def view(
 
     lcf3d view kitti:KITTI --frame 000008 --results fused/
 
+    lcf3d view fused/ --limit 100 --gif fused.gif
+
     lcf3d view fused/ --rerun fused.rrd
     """
     from rich.progress import Progress
 
     from lcf3d.datasets.opening import open_dataset
-    from lcf3d.visualization.png import draw_frame, save_png
+    from lcf3d.visualization.png import draw_frame, save_gif, save_png
 
     run_folder = _run_folder(source)
     if run_folder and results:
@@ -60,6 +65,14 @@ def view(
         _record(dataset, shown, ids, None if rerun == "viewer" else Path(rerun), truth)
         return
     scene_of = _scenes(dataset, shown, truth, min_score, ids[0])
+    if gif is not None:
+        if gif.suffix.lower() != ".gif" or out is not None:
+            raise ConfigError(f"--gif takes a file that ends in .gif and goes without --out, got {gif}")
+        with Progress(disable=len(ids) < 2) as progress:
+            frames = (dataset.frame(frame_id) for frame_id in progress.track(ids, description="drawing"))
+            save_gif(((frame.timestamp, draw_frame(frame, scene_of(frame))) for frame in frames), gif)
+        typer.echo(f"{len(ids)} frames in {gif}")
+        return
     paths = _paths(ids, out, run_folder)
     with Progress(disable=len(ids) < 2) as progress:
         for frame_id in progress.track(ids, description="drawing"):
@@ -143,6 +156,7 @@ def _scenes(
     from lcf3d.run.table_folder import open_run_folder
     from lcf3d.structures import Detections3D
     from lcf3d.visualization.scene import Scene
+    from lcf3d.visualization.trails import Trails
 
     if shown is not None and not shown.exists():
         raise ConfigError(f"{shown} does not exist; --results takes a run folder or result files of the dataset's form")
@@ -150,7 +164,13 @@ def _scenes(
         return lambda frame: Scene.from_detections(Detections3D.empty(()), truth=frame.labels if truth else None)
     if RunFolder.is_run(shown):
         folder = open_run_folder(shown)
-        return lambda frame: Scene.from_fused(folder.read(frame.id), frame.labels if truth else None, min_score)
+        trails = Trails()
+
+        def fused_scene(frame: Frame) -> Scene:
+            fused = folder.read(frame.id)
+            return Scene.from_fused(fused, frame.labels if truth else None, min_score, trails(frame, fused))
+
+        return fused_scene
     boxes, flat = _result_readers(dataset, shown, first)
 
     def scene(frame: Frame) -> Scene:

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lcf3d.datasets.kitti import KittiCalibration, matrix_entry, read_calibration, read_entries
+from lcf3d.datasets.kitti_calibration import KittiCalibration, matrix_entry, read_calibration, read_entries
 from lcf3d.errors import DatasetError
 from lcf3d.files import list_files
 from lcf3d.formats.kitti import KittiObjects, detections_3d

@@ -103,7 +103,9 @@ def pack_counts(runs: Sequence[int]) -> str:
     return "".join(characters)
 
 
-def read_camera_detections(path: Path, class_names: Sequence[str], left_out: LeftOut | None = None) -> CameraDetections:
+def read_camera_detections(
+    path: str | Path, class_names: Sequence[str], left_out: LeftOut | None = None
+) -> CameraDetections:
     """Detections of a simple list (see the module's text) by (sample token, camera), with masks where there are some.
 
     Classes that are none of ``class_names`` (`lcf3d.detectors.joins`) are left out and counted in ``left_out``.
@@ -114,7 +116,7 @@ def read_camera_detections(path: Path, class_names: Sequence[str], left_out: Lef
     return _group(path, _records(path), lambda r: (str(r["sample_token"]), str(r["camera"])), class_names, left_out)
 
 
-def write_camera_detections(path: Path, detections: Mapping[tuple[str, str], Detections2D]) -> None:
+def write_camera_detections(path: str | Path, detections: Mapping[tuple[str, str], Detections2D]) -> None:
     """Write detections by (sample token, camera) as a simple list; masks are not written."""
     records = []
     for (token, camera), found in detections.items():
@@ -243,7 +245,7 @@ def read_coco_annotations(
     return {**looked_at, **_group(path, named, lambda r: images[r["image_id"]], class_names, None)}
 
 
-def _records(path: Path) -> list[dict[str, Any]]:
+def _records(path: str | Path) -> list[dict[str, Any]]:
     records = read_json(path)
     if not isinstance(records, list) or not all(isinstance(record, dict) for record in records):
         raise FormatError(f"{path} must hold a list of detections, got {type(records).__name__}")

@@ -15,6 +15,7 @@ from lcf3d.errors import ConfigError
 from lcf3d.live.fuser import Fuser
 from lcf3d.live.settings import LiveResult
 from lcf3d.live.workers import Worker
+from lcf3d.visualization.trails import Trails
 
 # seconds of the stream between two lines of health
 HEALTH_PERIOD = 1.0
@@ -101,7 +102,10 @@ class Outputs:
         self._outputs: list[tuple[Output, Callable[[LiveResult], Any]]] = []
         self._log: Any = None
         if pictures is not None:
-            self._outputs.append((Output("pictures", lambda r: draw_result(r, pictures), realtime), lambda r: r))
+            trails = Trails()
+            self._outputs.append(
+                (Output("pictures", lambda r: draw_result(r, pictures, trails), realtime), lambda r: r)
+            )
         if rerun is not None:
             from lcf3d.visualization.rerun_log import RerunLog
 
@@ -139,10 +143,10 @@ class Outputs:
         self._log.log(result.frame, result.fused, latency_ms=result.latency_ms, alignment_deg=turned, health=health)
 
 
-def draw_result(result: LiveResult, folder: Path) -> None:
-    """A PNG of a result, named by its time in seconds."""
+def draw_result(result: LiveResult, folder: Path, trails: Trails) -> None:
+    """A PNG of a result, named by its time in seconds; tracks with the ways that they came since the one before."""
     from lcf3d.visualization.png import draw_frame, save_png
     from lcf3d.visualization.scene import Scene
 
-    picture = draw_frame(result.frame, Scene.from_fused(result.fused))
+    picture = draw_frame(result.frame, Scene.from_fused(result.fused, trails=trails(result.frame, result.fused)))
     save_png(picture, folder / f"{result.time:010.3f}.png")

@@ -19,7 +19,7 @@ from lcf3d.fusion.memory_config import MemoryConfig
 from lcf3d.fusion.memory_smooth import smooth_sequence
 from lcf3d.fusion.memory_state import Memory
 from lcf3d.processes import end_with_parent, workers
-from lcf3d.provenance import FusedDetections, Outcome, Reason
+from lcf3d.provenance import OUTCOMES, REASONS, FusedDetections
 from lcf3d.run.alignment import aligned_frame
 from lcf3d.run.folder import RunFolder
 from lcf3d.run.sources import DetectorOnFrames, LidarOnScans
@@ -165,11 +165,11 @@ class FrameRunner:
 def summarize(frame_id: str, fused: FusedDetections, milliseconds: dict[str, float]) -> FrameSummary:
     """Count what the fusion of one frame decided."""
     names = fused.detections.class_names
-    outputs = Counter(
-        (Outcome(outcome).name.lower(), names[label])
-        for outcome, label in zip(fused.outcomes, fused.detections.labels, strict=True)
-    )
-    dropped = Counter(Reason(reason).name.lower() for reason in fused.lidar.reason[fused.dropped_lidar])
+    # counted as numbers, named after it
+    codes = Counter(zip(fused.outcomes.tolist(), fused.detections.labels.tolist(), strict=True))
+    outputs = Counter({(OUTCOMES[outcome], names[label]): n for (outcome, label), n in codes.items()})
+    reasons = Counter(fused.lidar.reason[fused.dropped_lidar].tolist())
+    dropped = Counter({REASONS[reason]: n for reason, n in reasons.items()})
     return FrameSummary(frame_id, outputs, dropped, milliseconds=milliseconds)
 
 

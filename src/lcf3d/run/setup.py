@@ -142,9 +142,8 @@ def prepare_run(
     if request.shard is not None and (request.memory or request.smooth):
         raise ConfigError("--shard takes drives apart, and --memory and --smooth need them whole; leave one out")
     folder = TableRunFolder(out) if request.form == "parquet" else RunFolder(out, dataset.writer(out))
-    memory = MemoryConfig() if request.memory or request.smooth else None
     fusion = make_fusion(config, localizer)
-    runner = FrameRunner(dataset, lidar, cameras, fusion, folder, memory=memory, smooth=request.smooth)
+    runner = FrameRunner(dataset, lidar, cameras, fusion, folder, smooth=request.smooth)
     from lcf3d import __version__
 
     # checked before anything is written; with results in files this is quick
@@ -176,6 +175,8 @@ def prepare_run(
     if calibration is not None:
         calibration.dump(folder.calibration_path)
     runner.fusion = make_fusion(config, localizer, calibration, reported)
+    if request.memory or request.smooth:
+        runner.memory = MemoryConfig(classes=calibration.memory if calibration else {})
     return Run(dataset, own_ids, config, runner, folder, notes)
 
 
@@ -332,6 +333,9 @@ def find_calibration(
 
 def _score_range(dataset: Dataset, frame_ids: Sequence[str], lidar: LidarSource) -> tuple[float, float]:
     """Lowest and highest score of the LiDAR branch over all frames, 0 and 0 without any."""
+    if hasattr(lidar, "score_range"):
+        known: tuple[float, float] = lidar.score_range(frame_ids)
+        return known
     low, high = 0.0, 0.0
     for frame_id in frame_ids:
         scores = lidar.detect(dataset.frame(frame_id)).scores

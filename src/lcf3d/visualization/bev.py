@@ -14,7 +14,7 @@ from lcf3d.geometry.camera import pixel_rays
 from lcf3d.geometry.epipolar import camera_centre
 from lcf3d.kernels import kernel
 from lcf3d.structures import Camera, FloatArray
-from lcf3d.visualization.canvas import Canvas
+from lcf3d.visualization.canvas import Canvas, Colour
 from lcf3d.visualization.scene import COLOURS, TRUTH_COLOUR, Scene
 
 _GROUND = (16, 18, 22)
@@ -99,6 +99,8 @@ def draw_bev(
     if scene.truth is not None:
         for box in scene.truth:
             canvas.lines(_outline(box, view), TRUTH_COLOUR, width=1.0, opacity=0.85)
+    for i, way in enumerate(scene.trails):
+        _draw_trail(canvas, view.pixels(way[:, :2]), COLOURS[scene.outcomes[i]])
     for i in scene.drawing_order:
         colour, outline = COLOURS[scene.outcomes[i]], _outline(scene.boxes[i], view)
         if scene.outcomes[i] == "dropped":
@@ -112,6 +114,13 @@ def draw_bev(
         if text and shown:
             canvas.label(around, text, COLOURS[scene.outcomes[i]], size=11, filled=False)
     return canvas.image()
+
+
+def _draw_trail(canvas: Canvas, way: FloatArray, colour: Colour) -> None:
+    """A way of (K, 2) pixels, fainter the longer ago."""
+    for k in range(1, len(way)):
+        opacity = 0.15 + 0.65 * k / (len(way) - 1)
+        canvas.lines(np.concatenate([way[k - 1], way[k]])[None], colour, width=1.6, opacity=opacity)
 
 
 def _point_picture(points: NDArray[np.float32] | None, view: BevView) -> PIL.Image.Image:

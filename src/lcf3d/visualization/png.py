@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
 import PIL.Image
+import PIL.ImageOps
 from numpy.typing import NDArray
 
 from lcf3d.files import atomic_path
@@ -25,6 +26,8 @@ GRID_COLUMNS = 3
 GRID_WIDTH = 1680
 BEV_HEIGHT = 640
 SURROUND_BEV_HEIGHT = 840
+# of a moving picture whose frames tell no time
+GIF_MS = 200
 
 
 def draw_frame(frame: Frame, scene: Scene, cameras: Sequence[str] | None = None, bev: bool = True) -> PIL.Image.Image:
@@ -59,6 +62,30 @@ def save_png(picture: PIL.Image.Image, path: Path) -> None:
     """Write a picture as PNG, whole or not at all."""
     with atomic_path(Path(path)) as temporary:
         temporary.write_bytes(png_bytes(np.asarray(picture.convert("RGB"))))
+
+
+def save_gif(pictures: Iterable[tuple[float | None, PIL.Image.Image]], path: Path) -> None:
+    """Write a picture that moves, half as large, whole or not at all.
+
+    Args:
+        pictures: at least one, each with its time in seconds; those without stay for a fifth of a second.
+        path: the ``.gif`` file.
+    """
+    times, small = [], []
+    for time, picture in pictures:
+        times.append(time)
+        # a palette found by median cut takes longer than all the rest
+        small.append(picture.reduce(2).quantize(method=PIL.Image.Quantize.FASTOCTREE))
+    milliseconds = []
+    for now, then in zip(times, [*times[1:], None], strict=True):
+        seconds = then - now if now is not None and then is not None else 0.0
+        milliseconds.append(round(seconds * 1e3) if 0 < seconds <= 2 else GIF_MS)
+    # all the same size: pictures of frames with fewer cameras are smaller
+    size = (max(p.width for p in small), max(p.height for p in small))
+    same = [p if p.size == size else PIL.ImageOps.pad(p.convert("RGB"), size) for p in small]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_path(path) as temporary:
+        same[0].save(temporary, "GIF", save_all=True, append_images=same[1:], duration=milliseconds, loop=0)
 
 
 def png_bytes(pixels: NDArray[np.uint8]) -> bytes:

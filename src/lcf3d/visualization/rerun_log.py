@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,17 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lcf3d.errors import MissingExtraError
-from lcf3d.geometry.rotation import invert_rigid, quaternions_from_yaws, transform_points
+from lcf3d.geometry.rotation import quaternions_from_yaws
 from lcf3d.provenance import FusedDetections
 from lcf3d.structures import Camera, Detections3D, FloatArray, Frame
 from lcf3d.visualization.scene import CAMERA_COLOUR, COLOURS, TRUTH_COLOUR, Scene, drawn_dropped
+from lcf3d.visualization.trails import Trails
 
 _GREY = (110, 115, 120)
 # scans and images of more than this are thinned, so that a recording of a drive stays small
 MOST_POINTS = 60_000
 JPEG_QUALITY = 80
-# places of a track that its trail shows
-TRAIL = 50
 
 
 class RerunLog:
@@ -52,7 +50,7 @@ class RerunLog:
         self._stream.send_blueprint(_blueprint(rerun.blueprint, cameras, stream))
         self._stream.log("world", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         self._index = 0
-        self._trails: dict[int, deque[FloatArray]] = {}
+        self._trails = Trails()
         self._messages: dict[str, str] = {}
 
     def log(
@@ -67,8 +65,7 @@ class RerunLog:
     ) -> None:
         """One frame: cameras with images and boxes, the scan coloured by what was decided, boxes with their reasons.
 
-        Where the boxes have tracks, each has the way that it came: over ground if the frame has a pose, else as the
-        LiDAR saw it.
+        Where the boxes have tracks and the frame a pose, each has the way over ground that it came.
 
         Args:
             frame: the frame.
@@ -78,7 +75,7 @@ class RerunLog:
             alignment_deg: how far each camera has turned against its calibration, by name, for the timeline.
             health: of a stream, as `lcf3d.live.fuser.Fuser.diagnostics` gives it.
         """
-        scene = Scene.from_fused(fused, truth)
+        scene = Scene.from_fused(fused, truth, trails=self._trails(frame, fused))
         self._stream.set_time("frame", sequence=self._index)
         if frame.timestamp is not None:
             self._stream.set_time("time", duration=frame.timestamp)
@@ -86,7 +83,10 @@ class RerunLog:
         reasons = [fused.explain(i) for i in range(len(fused))]
         reasons += [fused.explain_lidar(int(i)) for i in drawn_dropped(fused)]
         self._log_boxes("world/boxes", scene.boxes, [COLOURS[o] for o in scene.outcomes], reasons)
-        self._log_trails(frame, fused, scene)
+        if fused.tracks is not None:
+            ways = [way for way in scene.trails if len(way) > 1]
+            colours = [COLOURS[o] for o, way in zip(scene.outcomes, scene.trails, strict=False) if len(way) > 1]
+            self._stream.log("world/trails", self._rerun.LineStrips3D(ways, colors=np.array(colours).reshape(-1, 3)))
         if scene.truth is not None:
             self._log_boxes("world/truth", scene.truth, [TRUTH_COLOUR] * len(scene.truth), ())
         self._log_points(frame.points, scene)
@@ -169,24 +169,6 @@ class RerunLog:
                     part = picture[mask.y : mask.y + height, mask.x : mask.x + width]
                     part[mask.bitmap[: part.shape[0], : part.shape[1]]] = number % 255 + 1
             self._stream.log(f"world/cameras/{name}/image/masks", self._rerun.SegmentationImage(picture, opacity=0.4))
-
-    def _log_trails(self, frame: Frame, fused: FusedDetections, scene: Scene) -> None:
-        """The latest `TRAIL` places of every track of this frame, in the frame's coordinates."""
-        if fused.tracks is None:
-            return
-        world = np.eye(4) if frame.world_from_lidar is None else frame.world_from_lidar
-        ids = [int(number) for number in fused.tracks.ids]
-        self._trails = {number: self._trails.get(number, deque(maxlen=TRAIL)) for number in ids}
-        for number, place in zip(ids, transform_points(fused.detections.boxes[:, :3], world), strict=True):
-            self._trails[number].append(place)
-        back = invert_rigid(world)
-        strips = [transform_points(np.array(self._trails[number]), back) for number in ids]
-        colours = np.array([COLOURS[outcome] for outcome in scene.outcomes[: len(ids)]], dtype=np.uint8)
-        labels = [f"track {number}" for number in ids]
-        self._stream.log(
-            "world/trails",
-            self._rerun.LineStrips3D(strips, colors=colours.reshape(-1, 3), labels=labels or None, show_labels=False),
-        )
 
     def _log_reasons(self, fused: FusedDetections, reasons: Sequence[str]) -> None:
         lines = [f"- {reason}" for reason in reasons] + [f"- *{note}*" for note in fused.notes]
