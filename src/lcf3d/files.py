@@ -10,6 +10,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import shutil
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -17,6 +18,8 @@ from pathlib import Path
 from typing import Any
 
 from lcf3d.errors import ConfigError, DatasetError, FormatError, Lcf3dError
+from lcf3d.remote.places import publish
+from lcf3d.remote.urls import is_url, url_of
 
 GIGABYTE = 1 << 30
 MOST_GIGABYTES = 8.0
@@ -30,13 +33,19 @@ _SHOWN = 120
 def atomic_path(path: str | Path) -> Iterator[Path]:
     """A temporary path beside ``path`` to write to; it takes the place of ``path`` when the block ends well.
 
+    Where ``path`` stands for a file elsewhere (`lcf3d.remote`), the finished file is sent there first.
+
     Its name begins with a dot and holds the process's number: no listing takes it for a finished file, and
     `remove_left_overs` finds it after a crash.
 
     Raises:
         OSError: no place left, no permission ...; names ``path``.
+        DatasetError: it cannot be written where it lies.
+        ConfigError: a URL that no folder here stands for.
     """
     path = Path(path)
+    if is_url(path):
+        raise ConfigError(f"{url_of(path)} lies elsewhere, and this is written on this machine only; name a path of it")
     folder = path.parent
     if not os.path.isdir(folder):
         folder.mkdir(parents=True, exist_ok=True)
@@ -44,6 +53,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     moved = False
     try:
         yield temporary
+        publish(temporary, path)
         os.replace(temporary, path)
         moved = True
     except OSError as error:
@@ -210,6 +220,12 @@ def write_text(path: str | Path, text: str) -> None:
     """Write ``text`` to ``path``, whole or not at all."""
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
         file.write(text.encode())
+
+
+def copy_file(source: Path, path: Path) -> None:
+    """Copy a file to ``path``, whole or not at all."""
+    with atomic_path(path) as temporary:
+        shutil.copyfile(source, temporary)
 
 
 def write_json(path: str | Path, value: Any, indent: int | None = 2) -> None:

@@ -1,7 +1,7 @@
 """Look through the built pages: ``python tests/docs/site.py SITE``, exit code 1 with what is wrong.
 
-Every link, picture, script and style leads to a file of the site, from the page for lost visitors (404) as well, nothing
-is loaded from another host, and what people look for is found.
+Every link, picture, script and style leads to a file of the site, from the page for lost visitors (404) as well,
+nothing is loaded from another host, and what people look for is found.
 """
 
 from __future__ import annotations
@@ -14,11 +14,47 @@ from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
 LOOKED_FOR = (
-    "KITTI", "nuScenes", "Argoverse", "YOLO", "ONNX", "mmdet3d", "OpenPCDet", "ultralytics", "supervision", "rosbag", "ROS 2",
-    "MCAP", "calibration", "extrinsics", "distortion", "fisheye", "timestamp", "tracking", "stereo", "segmentation", "occlusion",
-    "false positive", "confidence", "threshold", "average precision", "NDS", "parquet", "Slurm", "COCO", "PointPillars",
-    "quaternion", "yaw", "coordinate", "frustum", "GPU", "CUDA", "install", "overwrite", "resume", "license",
-)  # fmt: skip
+    "KITTI",
+    "nuScenes",
+    "Argoverse",
+    "YOLO",
+    "ONNX",
+    "mmdet3d",
+    "OpenPCDet",
+    "ultralytics",
+    "supervision",
+    "rosbag",
+    "ROS 2",
+    "MCAP",
+    "calibration",
+    "extrinsics",
+    "distortion",
+    "fisheye",
+    "timestamp",
+    "tracking",
+    "stereo",
+    "segmentation",
+    "occlusion",
+    "false positive",
+    "confidence",
+    "threshold",
+    "average precision",
+    "NDS",
+    "parquet",
+    "Slurm",
+    "COCO",
+    "PointPillars",
+    "quaternion",
+    "yaw",
+    "coordinate",
+    "frustum",
+    "GPU",
+    "CUDA",
+    "install",
+    "overwrite",
+    "resume",
+    "licence",
+)
 
 
 class Links(HTMLParser):

@@ -1,4 +1,4 @@
-"""Every Python block and every command of the README and the docs, run on tiny data, or marked with the reason why not."""
+"""Every Python block and command of the README and the docs, run on tiny data, or marked with the reason why not."""
 
 from __future__ import annotations
 
@@ -120,7 +120,7 @@ class Parsed(Exception):
 
 
 def read_script_arguments(words: list[str], told: str) -> None:
-    """Let a script of ``benchmarks`` read its arguments with its own parser; what it then does takes minutes or data."""
+    """Let a script of ``benchmarks`` read its arguments with its own parser; what it then does takes minutes."""
     script = ROOT / words[0]
     assert script.is_file(), f"{told}: no such script"
     parse = argparse.ArgumentParser.parse_args

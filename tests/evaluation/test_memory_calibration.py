@@ -125,3 +125,41 @@ def test_frames_without_order_are_refused(drives: tuple[str, str, str], tmp_path
         lcf3d("calibrate", f"kitti:{tmp_path}", "--lidar", f"results:{lidar}", "--camera", f"results:{camera}",
               "--memory", "--out", tmp_path / "c.json")  # fmt: skip
     assert not (tmp_path / "c.json").exists()
+
+
+def test_jobs_and_the_order_of_frames_change_nothing(drives: tuple[str, str, str], tmp_path: Path) -> None:
+    dataset, lidar, camera = drives
+    names = [f"{s:04d}_{i:06d}" for s in range(2) for i in range(10)]
+    mixed = [*names[::2], *names[1::2]][::-1]
+    branches = ("--lidar", lidar, "--camera", camera, "--recovery", "off", "--calibration")
+    file = tmp_path / "c.json"
+    lcf3d("calibrate", dataset, *branches[:4], "--folds", 0, "--out", file)
+    for out, frames, more in (("one", names, ()), ("two", names, ("--jobs", 2)), ("mixed", mixed, ("--jobs", 2))):
+        chosen = [part for name in frames for part in ("--frame", name)]
+        lcf3d("run", dataset, *chosen, *branches, file, "--memory", *more, "--out", tmp_path / out)
+    for part in ("provenance", "tracks", "data"):
+        one = {p.name: p.read_bytes() for p in (tmp_path / "one" / part).iterdir()}
+        assert one
+        for other in ("two", "mixed"):
+            assert {p.name: p.read_bytes() for p in (tmp_path / other / part).iterdir()} == one
+    assert any(found.tracks.predicted.any() for found in read_run(tmp_path / "one").values())
+
+
+def test_a_gap_in_a_drive_is_told(drives: tuple[str, str, str], tmp_path: Path) -> None:
+    dataset, lidar, camera = drives
+    frames = [part for i in (0, 1, 2, 20, 21) for part in ("--frame", f"0000_{i:06d}")]
+    text = lcf3d("run", dataset, *frames, "--lidar", lidar, "--camera", camera, "--recovery", "off", "--memory",
+                 "--json", "--out", tmp_path / "out")  # fmt: skip
+    assert '"no frame for 1.80 s: the memory began anew": 1' in text
+
+
+def test_the_report_and_pictures_of_a_run_with_predicted_boxes(drives: tuple[str, str, str], tmp_path: Path) -> None:
+    dataset, lidar, camera = drives
+    out = tmp_path / "out"
+    branches = ("--lidar", lidar, "--camera", camera, "--recovery", "off")
+    lcf3d("run", dataset, "--split", "val", *branches, "--memory", "--out", out)
+    shown = next(name for name, found in read_run(out).items() if "predicted" in found.origins)
+    lcf3d("view", out, "--frame", shown, "--out", tmp_path / "one.png")
+    assert (tmp_path / "one.png").is_file()
+    lcf3d("eval", dataset, out, "--split", "val", "--out", tmp_path / "report")
+    assert '"predicted"' in (tmp_path / "report" / "report.html").read_text()

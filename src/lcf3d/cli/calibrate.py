@@ -45,6 +45,7 @@ def calibrate(
     from lcf3d.cli.console import console, plain, print_table, tracked
     from lcf3d.evaluation.calibration_study import open_study
     from lcf3d.evaluation.memory_calibration import MemoryStudy
+    from lcf3d.remote.places import local_file
     from lcf3d.run.setup import RunRequest
 
     request = RunRequest(
@@ -59,7 +60,7 @@ def calibrate(
     calibration = calibration.model_copy(update={"source": f"{frames}, {lidar} with {camera}"})
     reports = study.cross_validate(calibration) if folds else []
     remembered = drives.cross_validate(calibration) if folds and drives is not None else []
-    calibration.dump(out)
+    calibration.dump(local_file(out))
     if json_:
         values: dict[str, Any] = {"out": str(out), "frames": len(study.frames), "folds": folds}
         values |= {"classes": [asdict(r) for r in reports], "memory": [asdict(r) for r in remembered]}

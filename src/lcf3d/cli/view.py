@@ -53,13 +53,14 @@ def view(
     from rich.progress import Progress
 
     from lcf3d.datasets.opening import open_dataset
+    from lcf3d.remote.places import local
     from lcf3d.visualization.png import draw_frame, save_gif, save_png
 
     run_folder = _run_folder(source)
     if run_folder and results:
         raise ConfigError(f"{source} is a run folder and holds its own results; leave --results out")
     dataset = _open_run(run_folder) if run_folder else open_dataset(source)
-    shown = run_folder or results
+    shown = run_folder or (None if results is None else local(results))
     ids = _frame_ids(dataset, frame or [], shown, limit)
     if rerun is not None:
         _record(dataset, shown, ids, None if rerun == "viewer" else Path(rerun), truth)
@@ -86,13 +87,14 @@ def _record(dataset: Dataset, shown: Path | None, ids: Sequence[str], path: Path
     from rich.progress import Progress
 
     from lcf3d.run.folder import RunFolder
+    from lcf3d.run.table_folder import open_run_folder
     from lcf3d.visualization.rerun_log import RerunLog
 
     if shown is None or not RunFolder.is_run(shown):
         raise ConfigError("--rerun shows a run with its reasons: name a folder written by lcf3d run")
     if path is not None and path.suffix != ".rrd":
         raise ConfigError(f"--rerun takes a file that ends in .rrd, or viewer, got {path}")
-    folder = RunFolder(shown)
+    folder = open_run_folder(shown)
     log = RerunLog(path, dataset.used_cameras)
     with Progress(disable=len(ids) < 2) as progress:
         for frame_id in progress.track(ids, description="recording"):
@@ -104,12 +106,14 @@ def _record(dataset: Dataset, shown: Path | None, ids: Sequence[str], path: Path
 
 def _run_folder(source: str) -> Path | None:
     """The path, if it is a folder written by ``lcf3d run``."""
+    from lcf3d.remote.places import local
+    from lcf3d.remote.urls import is_url
     from lcf3d.run.folder import RunFolder
 
-    path = Path(source).expanduser()
+    path = local(source) if is_url(source) else Path(source).expanduser()
     if RunFolder.is_run(path):
         return path
-    if ":" not in source and not path.exists():
+    if (":" not in source or is_url(source)) and not path.exists():
         raise ConfigError(f"{source} does not exist; view takes kind:ROOT or a folder of lcf3d run")
     return None
 

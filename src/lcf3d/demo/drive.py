@@ -154,6 +154,7 @@ def drive(detectors: Detectors, count: int = FRAMES) -> Iterator[dict[str, DemoF
 def _look(detectors: Detectors, fusion: LateCascadeFusion, frame: Frame, pool: ThreadPoolExecutor) -> DemoFrame:
     """One moment through both networks in parallel threads, and the fusion."""
     points, ((name, image),) = frame.points, frame.images.items()
+    assert points is not None
     started = time.perf_counter()
     lidar = pool.submit(_timed, lambda: detectors.lidar(points))
     camera = pool.submit(_timed, lambda: detectors.camera([image])[0])

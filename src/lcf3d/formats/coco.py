@@ -253,7 +253,7 @@ def _records(path: str | Path) -> list[dict[str, Any]]:
 
 
 def _group(
-    path: Path, records: list[dict[str, Any]], key: Any, class_names: Sequence[str], left_out: LeftOut | None
+    path: str | Path, records: list[dict[str, Any]], key: Any, class_names: Sequence[str], left_out: LeftOut | None
 ) -> CameraDetections:
     """Detections of ``records`` by ``key``."""
     names = tuple(class_names)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from lcf3d.errors import FormatError, MissingExtraError
 from lcf3d.files import atomic_path
+from lcf3d.remote.places import fetched
 
 TEXT = np.dtype(object)
 """The type to ask for in `read_columns` where a column holds text."""
@@ -31,7 +32,7 @@ def read_columns(path: Path, columns: Mapping[str, Any], optional: tuple[str, ..
     """
     arrow = _arrow("reading feather files")
     try:
-        with arrow.OSFile(str(path)) as file:
+        with arrow.OSFile(str(fetched(path))) as file:
             present = arrow.ipc.open_file(file).schema.names
             absent = [name for name in columns if name not in present and name not in optional]
             if absent:

@@ -13,6 +13,7 @@ from typing import Any
 from lcf3d.errors import ConfigError, FormatError
 from lcf3d.files import atomic_path
 from lcf3d.provenance import REAL, WHOLE, Decisions, FusedDetections, TrackTable
+from lcf3d.remote.places import fetched
 
 SCHEMA = "1"
 _KEY = b"lcf3d.schema"
@@ -131,7 +132,7 @@ def read_frames(path: Path) -> Iterator[tuple[str, FusedDetections]]:
 def _open(path: Path) -> Any:
     pa = arrow()
     try:
-        file = pa.parquet.ParquetFile(path)
+        file = pa.parquet.ParquetFile(fetched(path))
     except FileNotFoundError:
         raise FormatError(f"{path} does not exist") from None
     except (pa.ArrowInvalid, OSError) as error:

@@ -17,6 +17,7 @@ from lcf3d.errors import ConfigError
 from lcf3d.files import read_json, write_text
 from lcf3d.fusion.evidence import Evidence, to_probability
 from lcf3d.fusion.memory_config import ClassMemory
+from lcf3d.remote.places import local
 from lcf3d.structures import Detections, Detections2D, Detections3D, FloatArray, with_columns
 
 Transform = Literal["identity", "log", "logit"]
@@ -170,7 +171,7 @@ def load_calibration(text: str) -> Calibration | None:
         return None
     if text == "auto":
         raise ConfigError("'auto' calibrates on the frames of a run: see lcf3d.fusion.self_calibration")
-    return Calibration.load(text)
+    return Calibration.load(local(text))
 
 
 def ground_height(bottoms: FloatArray) -> float | None:

@@ -15,6 +15,7 @@ from lcf3d.errors import ConfigError, FormatError
 from lcf3d.files import read_text, reading, write_text
 from lcf3d.fusion.evidence import ROLE_EVIDENCE, Evidence
 from lcf3d.fusion.roles import ROLES, role_of
+from lcf3d.remote.places import local
 from lcf3d.structures import ARGOVERSE_CLASSES, KITTI_CLASSES, NUSCENES_CLASSES, FloatArray
 
 Fraction = Annotated[float, Field(ge=0, le=1)]
@@ -151,7 +152,7 @@ class FusionConfig(BaseModel):
         own: dict[str, Any] = {} if class_names is None else {"class_names": tuple(class_names)}
         if name_or_path in PRESETS:
             return cls.preset(str(name_or_path), **({} if "class_names" in PRESETS[str(name_or_path)] else own))
-        path = Path(name_or_path).expanduser()
+        path = local(name_or_path)
         if not path.is_file():
             raise ConfigError(f"{str(name_or_path)!r} is neither a preset ({', '.join(PRESETS)}) nor a file")
         try:

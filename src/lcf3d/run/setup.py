@@ -104,6 +104,7 @@ class Run:
         config: settings.
         runner: what to do with a frame.
         folder: where results go.
+        request: what was asked for.
         notes: what of the inputs is left out, and which classes no camera is asked about; once a run.
     """
 
@@ -112,6 +113,7 @@ class Run:
     config: FusionConfig
     runner: FrameRunner
     folder: RunFolder
+    request: RunRequest
     notes: tuple[str, ...] = ()
 
 
@@ -177,13 +179,14 @@ def prepare_run(
     runner.fusion = make_fusion(config, localizer, calibration, reported)
     if request.memory or request.smooth:
         runner.memory = MemoryConfig(classes=calibration.memory if calibration else {})
-    return Run(dataset, own_ids, config, runner, folder, notes)
+    return Run(dataset, own_ids, config, runner, folder, request, notes)
 
 
 def read_inputs(
     request: RunRequest,
     usual: Callable[[Dataset], Sequence[str]] | None = None,
     settings: FusionConfig | None = None,
+    look: bool = True,
 ) -> Inputs:
     """The dataset, settings and both branches, result files read and images looked for.
 
@@ -191,6 +194,7 @@ def read_inputs(
         request: what to read.
         usual: the frames to take where neither a split nor frames are named; all without it.
         settings: instead of those that the request names.
+        look: read all result files and look for images; else each is read when its frame comes.
 
     Raises:
         Lcf3dError: anything wrong with the request, the dataset or the result files.
@@ -209,13 +213,15 @@ def read_inputs(
     if usual is not None and not chosen and request.split is None:
         chosen = usual(dataset)
     frame_ids = require_frames(dataset, chosen, request.dataset)
-    dataset.require_complete(frame_ids)
+    if look:
+        dataset.require_complete(frame_ids)
     lidar = open_lidar(request.lidar, dataset, config.class_names, request.missing)
     cameras = by_camera(dataset, open_cameras(texts, dataset, config.class_names, request.missing, request.tiles))
-    for source in (lidar, *cameras.values()):
-        if hasattr(source, "load"):
-            source.load(frame_ids)
-    _require_images(dataset, frame_ids, cameras)
+    if look:
+        for source in (lidar, *cameras.values()):
+            if hasattr(source, "load"):
+                source.load(frame_ids)
+        _require_images(dataset, frame_ids, cameras)
     return Inputs(dataset, frame_ids, config, lidar, cameras, load_localizer(request.localizer))
 
 

@@ -75,7 +75,6 @@ class OnnxDetector:
         self._iou_threshold = iou_threshold
         self._mapping = mapping
         self._imagenet = normalize == "imagenet"
-        self._threads = threads
         self._session = open_session(self.path, threads, "a camera detector")
         metadata = self._session.get_modelmeta().custom_metadata_map
         image_input = self._image_input()
@@ -167,13 +166,6 @@ class OnnxDetector:
             return list(self._session.run(self._outputs, inputs))
         except Exception as error:  # onnxruntime's exceptions share no base class
             raise DetectorError(f"{self.path} cannot be run on an image: {first_line(error)}") from error
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in self.__dict__.items() if name != "_session"}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        # a session cannot travel to another process: each opens its own
-        self.__dict__.update(state, _session=open_session(state["path"], state["_threads"], "a camera detector"))
 
     def _input_names(self) -> list[str]:
         return [node.name for node in self._session.get_inputs()]
