@@ -2,7 +2,7 @@
 
     python benchmarks/live_replay.py --hertz 10 --seconds 60          # in real time
     python benchmarks/live_replay.py --hertz 20 --seconds 60
-    python benchmarks/live_replay.py --minutes 30                     # as fast as it goes: is memory flat?
+    python benchmarks/live_replay.py --minutes 30 --watch-period 1    # as fast as it goes: is memory flat?
 
 The six cameras stand as nuScenes' do. Cars and people drive and walk about a car that drives itself; the LiDAR branch
 has their boxes with noise and false ones, each camera its 2D boxes at its own moment, with noise and misses. Poses come
@@ -16,6 +16,7 @@ import json
 import sys
 import time
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +24,9 @@ import numpy as np
 
 from lcf3d import Detections2D, Detections3D, FusionConfig, LateCascadeFusion
 from lcf3d.geometry.camera import project_boxes
-from lcf3d.live.fuser import Fuser, LiveResult, LiveSettings
+from lcf3d.live.fuser import Fuser
 from lcf3d.live.messages import CameraBoxes, EgoPose, LidarBoxes, Message
+from lcf3d.live.settings import LiveResult, LiveSettings
 from lcf3d.live.synchronizer import SyncSettings
 from lcf3d.simulation.presets import get_preset
 from lcf3d.structures import FloatArray
@@ -104,7 +106,20 @@ def memory_mb() -> float:
     return pages * 4096 / 2**20
 
 
-def run(hertz: float, seconds: float, realtime: bool) -> dict[str, Any]:
+def stream(drive: Drive, hertz: float, frames: int) -> Iterator[tuple[float, list[Message]]]:
+    """The messages of one frame after the other, with its time. After `LOOP` seconds the boxes come again."""
+    rng, loop = np.random.default_rng(1), round(LOOP * hertz)
+    made: list[list[Message]] = []
+    for i in range(frames):
+        moment = i / hertz
+        if i < loop:
+            made.append(list(drive.frame(moment, rng)))
+        shift = (i // loop) * LOOP
+        again = [replace(message, time=message.time + shift) for message in made[i % loop]]
+        yield moment, sorted([*again, *poses(moment, moment + 1 / hertz)], key=lambda message: message.time)
+
+
+def run(hertz: float, seconds: float, realtime: bool, watch_period: float) -> dict[str, Any]:
     """Stream so many seconds of driving; memory after every `EVERY` frames."""
     drive, clock = Drive(), Clock()
     config = FusionConfig(class_names=NAMES, recovery=False)
@@ -112,17 +127,14 @@ def run(hertz: float, seconds: float, realtime: bool) -> dict[str, Any]:
     fuser = Fuser(
         LateCascadeFusion(config),
         drive.cameras,
-        settings=LiveSettings(sync, realtime=realtime),
+        settings=LiveSettings(sync, realtime=realtime, watch_period=watch_period),
         on_result=clock,
     )
     fuser.warm_up()
-    rng = np.random.default_rng(1)
     frames = round(hertz * seconds)
     results, behind, memory, since = 0, 0, [], []
     start, cpu = time.perf_counter(), time.process_time()
-    for i in range(frames):
-        moment = i / hertz
-        messages = sorted([*drive.frame(moment, rng), *poses(moment, moment + 1 / hertz)], key=lambda m: m.time)
+    for i, (moment, messages) in enumerate(stream(drive, hertz, frames)):
         if realtime:
             left = start + moment - time.perf_counter()
             behind += left < -0.5 / hertz
@@ -166,6 +178,7 @@ class Clock:
         self.wall: list[float] = []
 
     def __call__(self, result: LiveResult) -> None:
+        """A result has come."""
         self.cpu.append((time.thread_time() - self.pushed) * 1e3)
         self.wall.append(result.latency_ms["added"])
 
@@ -181,9 +194,10 @@ def main() -> None:
     parser.add_argument("--hertz", type=float, default=10.0)
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--minutes", type=float, help="as fast as it goes instead of in real time")
+    parser.add_argument("--watch-period", type=float, default=0.1, help="seconds between moments that the watch sees")
     options = parser.parse_args()
     seconds = options.seconds if options.minutes is None else 60 * options.minutes
-    print(json.dumps(run(options.hertz, seconds, realtime=options.minutes is None), indent=1))
+    print(json.dumps(run(options.hertz, seconds, options.minutes is None, options.watch_period), indent=1))
 
 
 if __name__ == "__main__":

@@ -1,31 +1,37 @@
-"""How well the calibration watch finds a camera's time offset on Argoverse 2's real tracks and ego poses.
+"""How well the calibration watch finds a camera's time offset on Argoverse 2's real tracks, and on a made-up drive.
 
     python benchmarks/time_offset.py argoverse2/sensor/val/LOG --offsets 0 20 50 100 200
+    python benchmarks/time_offset.py made-up --offsets 0 20 50 100 200
 
 LiDAR boxes are the log's cuboids with noise, 10 a second. Camera detections are simulated at the cameras' own moments:
 every track is moved on along its path to the true moment of the image, projected with the ego pose of that moment
 (pinhole, no distortion), noised and thinned out; their time stamps are wrong by the offset. All of it goes through
 `lcf3d.live.Fuser`. ``--velocities`` says how well the detector knows velocities: the standard deviation of their error
-in m/s, or none for a detector without velocities (then only the car's own motion tells).
+in m/s, or none for a detector without velocities (then only the car's own motion tells). The made-up drive is that of
+`live_replay.py`, 30 seconds of it, with all six cameras.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from live_replay import Drive, poses
 
 from lcf3d import Camera, Detections2D, Detections3D, FusionConfig, LateCascadeFusion
 from lcf3d.fusion.alignment_watch import WatchSettings
 from lcf3d.geometry.boxes import transform_boxes
 from lcf3d.geometry.camera import project_boxes
 from lcf3d.geometry.rotation import invert_rigid, rigid_transforms, yaws_from_quaternions
-from lcf3d.live.fuser import Fuser, LiveSettings
+from lcf3d.live.fuser import Fuser
 from lcf3d.live.messages import CameraBoxes, EgoPose, LidarBoxes, Message
 from lcf3d.live.poses import PoseBuffer
+from lcf3d.live.settings import LiveSettings
 from lcf3d.live.synchronizer import SyncSettings
 from lcf3d.structures import BoolArray, FloatArray
 
@@ -38,6 +44,8 @@ NAMES = ("car", "pedestrian")
 CENTRE, SIZE, PIXELS, SHARE, MISSED = 0.1, 0.05, 2.0, 0.02, 0.15
 # boxes further than this, or with fewer points, are not detected
 RANGE, FEWEST_POINTS = 60.0, 10
+# of the made-up drive
+SECONDS = 30.0
 
 
 class Log:
@@ -149,17 +157,31 @@ def _seen(log: Log, camera: Camera, time: float, rng: np.random.Generator) -> De
     return Detections2D(edges[good], rng.uniform(0.6, 0.95, int(good.sum())), labels[visible][good], NAMES)
 
 
-def measure(log: Log, offset: float, velocities: float | None, window: int) -> dict[str, Any]:
+def made_up(drive: Drive, offset: float, velocities: float | None, rng: np.random.Generator) -> list[Message]:
+    """The same of a made-up drive of `SECONDS`, 10 scans a second."""
+    out: list[Message] = list(poses(0.0, SECONDS + 0.5))
+    for i in range(round(10 * SECONDS)):
+        for message in drive.frame(i / 10, rng, offset):
+            if isinstance(message, LidarBoxes):
+                speeds = message.detections.velocities
+                assert speeds is not None
+                noisy = None if velocities is None else speeds + rng.normal(0, velocities, speeds.shape)
+                message = replace(message, detections=replace(message.detections, velocities=noisy))
+            out.append(message)
+    return sorted(out, key=lambda message: message.time)
+
+
+def measure(cameras: Sequence[Camera], stream: list[Message], offset: float, window: int) -> dict[str, Any]:
     """Estimates of every camera at the end of the log and on the way."""
     config = FusionConfig(class_names=NAMES, recovery=False)
     sync = SyncSettings(tolerance=0.045, deadline=0.25, scans=False, poses=True)
     watch = WatchSettings(time=True, window=window)
-    fuser = Fuser(LateCascadeFusion(config), log.cameras, settings=LiveSettings(sync, watch=watch))
+    fuser = Fuser(LateCascadeFusion(config), cameras, settings=LiveSettings(sync, watch=watch))
     assert fuser.watch is not None
-    errors: dict[str, list[float]] = {camera.name: [] for camera in log.cameras}
-    sure: dict[str, list[float]] = {camera.name: [] for camera in log.cameras}
+    errors: dict[str, list[float]] = {camera.name: [] for camera in cameras}
+    sure: dict[str, list[float]] = {camera.name: [] for camera in cameras}
     alarms = dict.fromkeys(errors, 0)
-    for message in messages(log, offset, velocities, np.random.default_rng(0)):
+    for message in stream:
         for _ in fuser.push(message):
             for name in errors:
                 report = fuser.watch.report(name)
@@ -198,18 +220,21 @@ def _camera(name: str, row: Any, ego_from_camera: FloatArray) -> Camera:
 def main() -> None:
     """Read, measure, print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("log", type=Path)
+    parser.add_argument("log", help="folder of a log, or made-up")
     parser.add_argument("--offsets", type=float, nargs="+", default=[0, 20, 50, 100, 200], help="milliseconds")
     parser.add_argument("--velocities", default="0.5", help="standard deviation of their error in m/s, or none")
     parser.add_argument("--cameras", nargs="+", default=["ring_front_center", "ring_front_left", "ring_side_right"])
     parser.add_argument("--window", type=int, default=50)
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
-    log = Log(options.log, options.cameras)
     velocities = None if options.velocities == "none" else float(options.velocities)
+    source = Drive() if options.log == "made-up" else Log(Path(options.log), options.cameras)
     table = []
     for offset in options.offsets:
-        row = {"offset_ms": offset, "cameras": measure(log, offset / 1e3, velocities, options.window)}
+        rng = np.random.default_rng(0)
+        write = made_up if isinstance(source, Drive) else messages
+        stream = write(source, offset / 1e3, velocities, rng)  # type: ignore[operator]
+        row = {"offset_ms": offset, "cameras": measure(source.cameras, stream, offset / 1e3, options.window)}
         table.append(row)
         print(json.dumps(row), flush=True)
     if options.json:

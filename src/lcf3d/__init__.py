@@ -45,8 +45,9 @@ if TYPE_CHECKING:
     from lcf3d.fusion.pipeline import LateCascadeFusion
     from lcf3d.fusion.self_calibration import self_calibrate
     from lcf3d.fusion.stereo import StereoConfig, StereoLateCascadeFusion
-    from lcf3d.live.fuser import Fuser, LiveSettings
+    from lcf3d.live.fuser import Fuser
     from lcf3d.live.messages import CameraBoxes, CameraModel, EgoPose, Image, LidarBoxes, Scan
+    from lcf3d.live.settings import LiveSettings
     from lcf3d.live.synchronizer import SyncSettings
     from lcf3d.localizers.geometric import GeometricLocalizer
     from lcf3d.localizers.named import load_localizer
@@ -68,7 +69,7 @@ _LAZY = {
     "Fuser": "live.fuser",
     "Image": "live.messages",
     "LidarBoxes": "live.messages",
-    "LiveSettings": "live.fuser",
+    "LiveSettings": "live.settings",
     "Scan": "live.messages",
     "SyncSettings": "live.synchronizer",
     "WatchSettings": "fusion.alignment_watch",

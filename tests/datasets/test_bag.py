@@ -114,8 +114,11 @@ def test_objects_of_topics_are_fused_and_written_as_a_bag_again(tmp_path):
     assert np.allclose(found.boxes[order], expected, atol=1e-4)
 
 
-def write_drive_with_objects(path, frames=4):
-    """A drive whose objects come in the vehicle's frame; the ghost that only the LiDAR branch has is in view."""
+def write_drive_with_objects(path, frames=4, speed=None):
+    """A drive whose objects come in the vehicle's frame; the ghost that only the LiDAR branch has is in view.
+
+    With a speed (m/s) the vehicle moves in an odometry frame.
+    """
     writer = BagWriter(path)
     base_from_lidar = np.eye(4)
     base_from_lidar[:3, 3] = 1.2, 0, 1.8
@@ -124,6 +127,10 @@ def write_drive_with_objects(path, frames=4):
         labels = boxes_of(i)
         for name, pose in {"lidar": base_from_lidar}.items():
             _write_tf(writer, "base_link", name, pose, seconds)
+        if speed is not None:
+            moved = np.eye(4)
+            moved[0, 3] = speed * 0.1 * i
+            _write_tf(writer, "odom", "base_link", moved, seconds)
         for name, pose in POSES.items():
             _write_tf(writer, "lidar", name, invert_rigid(pose), seconds)
             seen = camera(name)

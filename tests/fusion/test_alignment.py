@@ -172,6 +172,15 @@ def test_noise_in_velocities_and_boxes_does_not_make_a_time_offset_smaller():
     assert fit_alignment(known, Alignment.nominal(), time=True).time_offset == pytest.approx(late, abs=0.004)
 
 
+def test_what_moves_is_seen_where_it_is_at_the_cameras_moment():
+    view = replace(camera(), delay=0.1)
+    boxes = np.array([car(12.0), car(25.0, 4.0)])
+    found = Detections2D(project_boxes(boxes, view)[0], np.full(2, 0.9), np.zeros(2, int), NAMES)
+    detections = replace(lidar(boxes, [0.9, 0.8]), velocities=np.array([[10.0, 5.0], [np.nan, np.nan]]))
+    sighting = Sighting.of(view, detections, found)
+    np.testing.assert_allclose(sighting.boxes[:, :2], boxes[:, :2] + [[1.0, 0.5], [0, 0]])
+
+
 def test_what_stands_is_sure_to_and_what_moves_is_not():
     view = camera()
     boxes = np.array([car(12.0), car(25.0, 4.0)])

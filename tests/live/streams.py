@@ -4,8 +4,9 @@ import numpy as np
 
 from lcf3d import FusionConfig, LateCascadeFusion
 from lcf3d.geometry.camera import project_boxes
-from lcf3d.live.fuser import Fuser, LiveSettings
+from lcf3d.live.fuser import Fuser
 from lcf3d.live.messages import CameraBoxes, EgoPose, LidarBoxes
+from lcf3d.live.settings import LiveSettings
 from lcf3d.live.synchronizer import SyncSettings
 from lcf3d.structures import Detections2D, Detections3D
 from tests.fusion.scenes import camera

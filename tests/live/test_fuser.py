@@ -122,6 +122,75 @@ def test_broken_times_and_poses_are_counted_and_nothing_stops():
     assert value(target, "lidar", "dropped") == "1"
 
 
+def test_after_time_went_back_poses_and_calibrations_are_those_of_the_new_time():
+    view = camera()
+    target = fuser([], poses=True)
+    wrong = realigned(view, np.array([0.0, 0.3, 0.0]))
+    target.push(CameraModel(90.0, wrong))
+    target.push(CameraModel(99.0, view))
+    old = [pose(100 + 0.05 * i, 0.0) for i in range(12)]
+    run(target, sorted([*stream(4, start=100.0), *old], key=lambda m: m.time))
+    # 20 m/s towards a standing box, from time 0 on
+    there, nearer = street(0, 1), street(0, 1) - [0.6, 0, 0, 0, 0, 0, 0]
+    target.push(LidarBoxes(0.0, boxes3d(there)))
+    new = [pose(0.0, 0.0), pose(0.1, 2.0), CameraBoxes(0.03, "left", boxes2d(view, nearer))]
+    results = run(target, new)
+    assert results[-1].time == 0.0
+    assert results[-1].fused.lidar.iou[0] == pytest.approx(1.0, abs=1e-6)
+
+
+def test_a_clock_that_is_set_right_is_no_problem_any_more():
+    view = camera()
+    target = fuser()
+    run(target, [LidarBoxes(0.0, boxes3d(street(0))), CameraBoxes(180.0, "left", boxes2d(view, street(0)))])
+    assert "clock" in entry(target, "camera left")["message"]
+    results = run(target, stream(3, start=0.1))
+    assert results[-1].fused.camera_names == ("left",)
+    assert "clock" not in entry(target, "camera left")["message"]
+
+
+def test_messages_that_were_cut_off_are_counted_and_the_rest_goes_on():
+    target = fuser(scans=True)
+    bad = [
+        Scan(0.0, np.zeros(7, np.float32)),
+        Scan(0.0, np.zeros((5, 2), np.float32)),
+        Image(0.0, "left", np.zeros((4, 4), np.uint8)),
+        LidarBoxes(0.0, None),
+        CameraBoxes(0.0, "left", None),
+    ]
+    scans = [Scan(0.1 * i, np.zeros((5, 4), np.float32)) for i in range(3)]
+    results = run(target, [*bad, *sorted([*stream(3), *scans], key=lambda m: m.time)])
+    assert len(results) == 3
+    assert all(r.fused.camera_names == ("left",) for r in results)
+    assert target.dropped() == {"camera left: broken": 2, "lidar: broken": 1, "scan: broken": 2}
+
+
+def test_a_callback_that_raises_stops_nothing():
+    def broken(result):
+        raise RuntimeError("no network")
+
+    target = fuser(on_result=broken)
+    assert len(run(target, stream(3))) == 3
+    assert entry(target, "fusion")["level"] == 2
+    assert "no network" in value(target, "fusion", "last_error")
+
+
+@pytest.mark.parametrize("gives", [None, [1, 2, 3]])
+def test_a_detector_that_gives_something_else_is_reported(gives):
+    target = fuser(detectors={"left": lambda images: [gives]}, lidar_detector=lambda points: gives)
+    pixels, points = np.zeros((4, 4, 3), np.uint8), np.zeros((5, 4), np.float32)
+    assert run(target, [Scan(0.0, points), Image(0.0, "left", pixels)]) == []
+    assert "must give Detections2D" in entry(target, "camera left")["message"]
+    assert "must give Detections3D" in entry(target, "lidar")["message"]
+
+
+def test_messages_of_a_camera_without_lidar_do_not_pile_up():
+    view = camera()
+    target = fuser()
+    run(target, [CameraBoxes(0.05 * i, "left", boxes2d(view, street(0))) for i in range(100)])
+    assert target.dropped() == {"camera left: overflow": 100 - 64}
+
+
 def test_a_calibration_may_come_late_and_change():
     view, turned = camera(), realigned(camera(), np.array([0.0, 0.1, 0.0]))
     messages = []
@@ -153,6 +222,21 @@ def test_detectors_run_on_scans_and_images_in_order():
     assert all(r.fused.camera_names == ("left",) for r in results)
     assert {"detect scan", "detect camera left"} <= set(results[0].latency_ms)
     assert results[0].frame.images["left"] is pixels
+
+
+def test_images_without_a_detector_are_told_and_pixels_beside_boxes_are_shown():
+    view, pixels = camera(), np.zeros((400, 1000, 3), np.uint8)
+    target = fuser()
+    boxes = boxes2d(view, street(0))
+    messages = [
+        LidarBoxes(0.0, boxes3d(street(0))),
+        Image(0.0, "left", pixels),
+        CameraBoxes(0.01, "left", boxes, pixels),
+    ]
+    (result,) = run(target, messages)
+    assert result.frame.images["left"] is pixels
+    assert result.fused.camera_names == ("left",)
+    assert "there is no detector" in value(target, "fusion", "notes")
 
 
 def test_a_detector_that_raises_is_reported_and_the_rest_goes_on():

@@ -1,6 +1,7 @@
 import numpy as np
+import pytest
 
-from lcf3d.live.messages import CameraBoxes, LidarBoxes, Scan
+from lcf3d.live.messages import CameraBoxes, Image, LidarBoxes, Scan
 from lcf3d.structures import Detections2D
 from tests.fusion.scenes import camera
 from tests.live.streams import NAMES, boxes2d, boxes3d, fuser, run, stream, street
@@ -86,3 +87,32 @@ def test_every_value_is_text_as_ros_wants_it():
     for status in target.diagnostics():
         assert set(status) == {"name", "level", "message", "hardware_id", "values"}
         assert all(isinstance(v["value"], str) and isinstance(v["key"], str) for v in status["values"])
+
+
+def test_delays_are_those_beyond_the_quickest_sensor(monkeypatch):
+    now = [1000.0]
+    monkeypatch.setattr("lcf3d.live.fuser.perf_counter", lambda: now[0])
+    target, view = fuser(), camera()
+    for i in range(20):
+        now[0] = 1000 + 0.1 * i + 0.02
+        target.push(LidarBoxes(0.1 * i, boxes3d(street(i))))
+        # the camera's message comes 50 ms after the LiDAR's of the same time, one in ten 20 ms later still
+        now[0] += 0.05 + (0.02 if i % 10 == 9 else 0)
+        target.push(CameraBoxes(0.1 * i, "left", boxes2d(view, street(i))))
+    assert float(value(target, "lidar", "delay_ms")) == 0
+    assert float(value(target, "camera left", "delay_ms")) == pytest.approx(50)
+    assert float(value(target, "camera left", "delay_spread_ms")) == pytest.approx(20, abs=1)
+
+
+def test_a_frozen_image_is_an_error():
+    def found(images):
+        return [boxes2d(camera(), street(0))]
+
+    rng, level = np.random.default_rng(0), []
+    for frozen in (False, True):
+        target, pixels = fuser(detectors={"left": found}), rng.integers(0, 255, (400, 1000, 3), dtype=np.uint8)
+        for i in range(6):
+            shown = pixels if frozen else rng.integers(0, 255, (400, 1000, 3), dtype=np.uint8)
+            run(target, [LidarBoxes(0.1 * i, boxes3d(street(i))), Image(0.1 * i, "left", shown)])
+        level.append(entry(target, "camera left")["level"])
+    assert level == [0, 2]

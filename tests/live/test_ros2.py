@@ -1,4 +1,6 @@
 import ast
+import runpy
+import sys
 import xml.etree.ElementTree as ET
 from pathlib import Path
 from types import SimpleNamespace
@@ -166,6 +168,54 @@ def test_the_package_is_one_that_colcon_builds():
         assert (PACKAGE / name).is_file()
     assert (PACKAGE / "resource" / "lcf3d_ros").is_file()
     ast.parse((PACKAGE / "launch" / "fuser.launch.py").read_text())
+
+
+def test_the_package_passes_the_rules_of_ros_packages():
+    """The parser that colcon reads ``package.xml`` with; colcon itself built the package where this was written."""
+    parse_package = pytest.importorskip("catkin_pkg.package").parse_package
+    told = []
+    package = parse_package(str(PACKAGE / "package.xml"), warnings=told)
+    package.validate(warnings=told)
+    assert told == []
+    assert package.get_build_type() == "ament_python"
+    needed = {depend.name for depend in package.exec_depends}
+    launched = ast.parse((PACKAGE / "launch" / "fuser.launch.py").read_text())
+    for node in ast.walk(launched):
+        if isinstance(node, ast.ImportFrom):
+            assert node.module.split(".")[0] in needed
+
+
+def test_the_launch_file_describes_one_node_with_its_parameters(monkeypatch):
+    class Made:
+        """A class of ``launch`` or ``launch_ros``: it keeps what it was made with."""
+
+        def __init__(self, *given, **named):
+            self.given, self.named = given, named
+
+    names = {
+        "ament_index_python.packages": {"get_package_share_directory": lambda package_name: f"/share/{package_name}"},
+        "launch": {"LaunchDescription": Made},
+        "launch.actions": {"DeclareLaunchArgument": Made},
+        "launch.substitutions": {"LaunchConfiguration": Made},
+        "launch_ros.actions": {"Node": Made},
+    }
+    for name, contents in names.items():
+        monkeypatch.setitem(sys.modules, name, SimpleNamespace(**contents))
+    description = runpy.run_path(str(PACKAGE / "launch" / "fuser.launch.py"))["generate_launch_description"]()
+    argument, node = description.given[0]
+    assert argument.given == ("params",)
+    assert argument.named["default_value"] == "/share/lcf3d_ros/config/fuser.yaml"
+    assert (node.named["package"], node.named["name"]) == ("lcf3d_ros", "lcf3d")
+    assert node.named["parameters"][0].given == ("params",)
+    # the executable is one that setup.py installs, and it is the node
+    assert f'"{node.named["executable"]} = lcf3d_ros.fuser:main"' in (PACKAGE / "setup.py").read_text()
+    sys.path.insert(0, str(PACKAGE))
+    try:
+        from lcf3d_ros.fuser import main
+    finally:
+        sys.path.remove(str(PACKAGE))
+    with pytest.raises(ConfigError, match="source a ROS 2"):
+        main()
 
 
 def test_the_parameter_file_names_parameters_that_there_are():

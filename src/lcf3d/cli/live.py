@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def live(
-    dataset: Annotated[str, typer.Argument(help="kitti:ROOT, nuscenes:ROOT or another installed kind")],
+    dataset: Annotated[str, typer.Argument(help="kitti:ROOT, bag:FILE or another installed kind")],
     lidar: Annotated[str, typer.Option(help="LiDAR detector, kind:argument, for example results:DIR")],
     camera: Annotated[str, typer.Option(help="camera detector of all cameras, kind:argument")],
     rate: Annotated[float, typer.Option(min=0, help="times as fast as it was; 0 for as fast as possible")] = 1.0,
@@ -29,6 +29,8 @@ def live(
     self_calibrate: Annotated[
         bool, typer.Option("--self-calibrate", help="turn each camera as the calibration watch says")
     ] = False,
+    memory: Annotated[bool, typer.Option("--memory", help="let recent frames testify too, and give tracks")] = False,
+    pictures: Annotated[Path | None, typer.Option(help="draw a PNG a frame into this folder")] = None,
     health: Annotated[Path | None, typer.Option(help="write a JSON line of health after each second here")] = None,
     rerun: Annotated[str | None, typer.Option(help="a .rrd file to record into, or viewer to watch it live")] = None,
     json_: Annotated[bool, typer.Option("--json", help="print the report as JSON")] = False,
@@ -40,10 +42,13 @@ def live(
     lcf3d live kitti:KITTI --lidar results:pointrcnn --camera results:rrc_2d --rate 1.0
 
     lcf3d live kitti:DRIVE --lidar shipped:kitti --camera shipped --self-calibrate
+
+    lcf3d live bag:drive.mcap --lidar topic:/lidar/objects --camera topic:/front/objects --pictures seen/
     """
     import json
 
-    from lcf3d.live.fuser import LiveResult
+    from lcf3d.fusion.memory_config import MemoryConfig
+    from lcf3d.live.outputs import Outputs
     from lcf3d.live.replay import make_fuser, replay
     from lcf3d.run.setup import RunRequest, find_calibration, make_fusion, read_inputs
 
@@ -58,41 +63,26 @@ def live(
     scores = find_calibration(calibration, inputs.dataset, frame_ids, inputs.lidar, inputs.cameras, inputs.config)
     fusion = make_fusion(inputs.config, inputs.localizer, scores)
     first = inputs.dataset.frame(frame_ids[0])
-    fuser = make_fuser(fusion, inputs.lidar, inputs.cameras, first, realtime=rate > 0, correct=self_calibrate)
-    fuser.warm_up()
-    lines: list[str] = []
-    said = [0.0]
-
-    log = None
-    if rerun is not None:
-        from lcf3d.visualization.rerun_log import RerunLog
-
-        log = RerunLog(None if rerun == "viewer" else Path(rerun), inputs.dataset.used_cameras)
-
-    def look(results: list[LiveResult]) -> None:
-        if log is not None:
-            for result in results:
-                log.log(result.frame, result.fused, latency_ms=result.latency_ms, alignment_deg=fuser.turned_deg())
-        if health is not None and results[-1].time - said[0] >= 1:
-            said[0] = results[-1].time
-            lines.append(json.dumps({"time": results[-1].time, "status": fuser.diagnostics()}))
-
-    report = replay(
-        inputs.dataset, frame_ids, inputs.lidar, inputs.cameras, fuser, rate=rate, hertz=hertz, on_results=look
+    fuser = make_fuser(
+        fusion, inputs.lidar, inputs.cameras, first, realtime=rate > 0, correct=self_calibrate,
+        memory=MemoryConfig() if memory else None,
+    )  # fmt: skip
+    outputs = Outputs(
+        fuser, rate > 0, pictures=pictures, rerun=rerun, health=health, cameras=inputs.dataset.used_cameras
     )
-    if log is not None:
-        log.close()
-    if health is not None:
-        from lcf3d.files import write_text
-
-        write_text(health, "\n".join(lines) + "\n")
+    fuser.warm_up()
+    report = replay(
+        inputs.dataset, frame_ids, inputs.lidar, inputs.cameras, fuser, rate=rate, hertz=hertz,
+        shown=pictures is not None or rerun is not None, on_results=outputs,
+    )  # fmt: skip
+    made = outputs.close()
     if json_:
-        typer.echo(json.dumps(report.to_json(), indent=2))
+        typer.echo(json.dumps({**report.to_json(), "outputs": made}, indent=2))
     else:
-        _print(report)
+        _print(report, made)
 
 
-def _print(report: ReplayReport) -> None:
+def _print(report: ReplayReport, made: list[str]) -> None:
     """The report for people."""
     from rich.console import Console
     from rich.table import Table
@@ -105,6 +95,8 @@ def _print(report: ReplayReport) -> None:
     for part, values in report.latency_ms.items():
         table.add_row(part, f"{values['median']:.2f}", f"{values['p99']:.2f}")
     console.print(table)
+    for sentence in made:
+        console.print(sentence, soft_wrap=True)
     for cause, count in report.dropped.items():
         console.print(f"dropped, {cause}: {count}")
     for status in report.diagnostics:

@@ -8,7 +8,7 @@ import numpy as np
 
 from lcf3d.fusion.alignment import BORDER_PX, MOVING_SPREAD, STANDING, BoxPairs, realigned
 from lcf3d.fusion.clustering import cluster_boxes
-from lcf3d.fusion.matching import assign
+from lcf3d.fusion.matching import assign, boxes_after
 from lcf3d.geometry.camera import pixel_rays, project_boxes
 from lcf3d.geometry.iou import image_iou
 from lcf3d.structures import BoolArray, Camera, Detections2D, Detections3D, FloatArray, IntArray
@@ -64,6 +64,8 @@ class Sighting:
         Suppression leaves one 3D box an object; those of them that may be in view (with the camera turned either way)
         and have the highest scores take part, three for every confident 2D detection.
         """
+        # objects that move on their own are where they are at the camera's moment
+        lidar = replace(lidar, boxes=boxes_after(lidar, camera.delay))
         sure = found[found.scores > CONFIDENT]
         chosen, votes = np.zeros(0, dtype=np.int64), np.zeros((0, 2))
         if len(sure) and len(lidar):

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import threading
-from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from time import perf_counter
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
 from lcf3d.detectors.base import CameraDetector, LidarDetector
 from lcf3d.errors import ConfigError
-from lcf3d.fusion.alignment_watch import AlignmentWatch, WatchSettings
+from lcf3d.fusion.alignment_watch import AlignmentWatch
+from lcf3d.fusion.memory import remember
+from lcf3d.fusion.memory_config import MemoryConfig
+from lcf3d.fusion.memory_state import Memory
 from lcf3d.fusion.pipeline import LateCascadeFusion
 from lcf3d.live.health import Health
 from lcf3d.live.messages import (
@@ -24,58 +26,18 @@ from lcf3d.live.messages import (
     LidarBoxes,
     Message,
     Scan,
+    is_whole,
     same_mount,
     source_of,
 )
-from lcf3d.live.poses import PoseBuffer, relative_velocities
-from lcf3d.live.synchronizer import CameraPart, Group, Synchronizer, SyncSettings
+from lcf3d.live.poses import PoseBuffer
+from lcf3d.live.settings import LiveResult, LiveSettings
+from lcf3d.live.synchronizer import CameraPart, Group, Synchronizer
 from lcf3d.live.warming import warm_up
+from lcf3d.live.watching import WatchFeed
 from lcf3d.live.workers import Worker, attempt
 from lcf3d.provenance import FusedDetections
-from lcf3d.structures import Camera, Detections2D, Detections3D, FloatArray, Frame
-
-# no moment waits longer than this for the watch (seconds)
-LONGEST_OFFSET = 0.5
-
-
-@dataclass(frozen=True)
-class LiveSettings:
-    """Settings of a `Fuser` beyond those of the fusion.
-
-    Attributes:
-        sync: how messages are grouped.
-        realtime: run detectors and the watch in threads, newest first. Without it they run when a message is pushed and
-            nothing is left out for want of time: the same messages give the same results.
-        watch: settings of the calibration watch, None for no watch.
-        watch_period: seconds from one frame that the watch looks at to the next: those in between show the same.
-        correct: turn each camera as the watch says, and move it in time.
-        leave_out_blinded: do not use a camera that confirms far fewer LiDAR boxes than it used to.
-    """
-
-    sync: SyncSettings = field(default_factory=SyncSettings)
-    realtime: bool = False
-    watch: WatchSettings | None = field(default_factory=WatchSettings)
-    watch_period: float = 0.1
-    correct: bool = False
-    leave_out_blinded: bool = True
-
-
-@dataclass(frozen=True, eq=False)
-class LiveResult:
-    """The fusion of one moment.
-
-    Attributes:
-        time: of the scan, in the sensors' clock.
-        frame: what was fused: cameras as they stood at their own moments, scan and images if there were any.
-        fused: the result with its provenance; its notes say which cameras were left out.
-        latency_ms: ``wait`` (first LiDAR message to last part), ``fusion``, ``added`` (last part to result); and
-            ``detect SOURCE`` where detectors ran. Not the same from run to run.
-    """
-
-    time: float
-    frame: Frame
-    fused: FusedDetections
-    latency_ms: dict[str, float]
+from lcf3d.structures import Camera, Detections2D, Detections3D, Frame
 
 
 class Fuser:
@@ -87,6 +49,7 @@ class Fuser:
         lidar_detector: runs on each `Scan`; without it `LidarBoxes` are pushed.
         camera_detectors: run on each `Image`, by camera name; cameras without one push `CameraBoxes`.
         settings: see `LiveSettings`.
+        memory: settings of the memory of recent frames, see `lcf3d.fusion.memory`; None to judge every moment alone.
         on_result: called with each result as soon as it is there, before health and the watch take their time.
 
     Raises:
@@ -107,9 +70,12 @@ class Fuser:
         lidar_detector: LidarDetector | None = None,
         camera_detectors: Mapping[str, CameraDetector] | None = None,
         settings: LiveSettings | None = None,
+        memory: MemoryConfig | None = None,
         on_result: Callable[[LiveResult], None] | None = None,
     ) -> None:
         self.fusion, self.settings = fusion, settings or LiveSettings()
+        self._memory_config = memory
+        self._memory: Memory | None = None
         self._on_result = on_result
         self._models: dict[str, list[tuple[float, Camera]]] = {c.name: [(-np.inf, c)] for c in cameras}
         self._detectors: dict[str, Any] = {f"camera {n}": d for n, d in (camera_detectors or {}).items()}
@@ -128,9 +94,12 @@ class Fuser:
         self._workers: dict[str, Worker] = {}
         self._detect_ms: dict[tuple[str, float], float] = {}
         self._results: list[LiveResult] = []
-        self._watched = -np.inf
-        self._unwatched: deque[tuple[Frame, Detections3D, dict[str, Detections2D]]] = deque()
         self._lock = threading.RLock()
+        self._feed: WatchFeed | None = None
+        if self.watch is not None:
+            workers = self._workers if self.settings.realtime else None
+            period = self.settings.watch_period
+            self._feed = WatchFeed(self.watch, self._poses, period, workers, self._lock, self.health)
 
     def push(self, message: Message) -> list[LiveResult]:
         """Take one message in; the results that are there by now and were not handed out before, in order of time."""
@@ -197,14 +166,18 @@ class Fuser:
             return
         if isinstance(message, Image | CameraBoxes) and message.camera not in self._models:
             self.health.tell_once(f"camera {message.camera} has no calibration yet: its messages wait for one")
+        if not is_whole(message):
+            self._sync.dropped[source, "broken"] += 1
+            return
         self.health.saw(source, message, arrival)
-        if not self._sync.admit(source, message.time):
+        restarts = self._sync.restarts
+        admitted = self._sync.admit(source, message.time)
+        if self._sync.restarts > restarts:
+            self._begin_anew()
+        if not admitted:
             return
         if isinstance(message, EgoPose):
-            if np.shape(message.world_from_lidar) == (4, 4) and np.isfinite(message.world_from_lidar).all():
-                self._poses.add(message.time, message.world_from_lidar)
-            else:
-                self._sync.dropped[source, "broken"] += 1
+            self._poses.add(message.time, message.world_from_lidar)
             return
         if isinstance(message, Scan):
             self._sync.add_scan(message.time, message.points, arrival)
@@ -213,7 +186,16 @@ class Fuser:
         elif isinstance(message, LidarBoxes):
             self._sync.add_lidar(message.time, message.detections, arrival)
         elif isinstance(message, CameraBoxes):
-            self._sync.add_camera(message.camera, CameraPart(message.time, message.detections, None, arrival))
+            self._sync.add_camera(message.camera, CameraPart(message.time, message.detections, message.pixels, arrival))
+        elif isinstance(message, Image):
+            self.health.tell_once(f"camera {message.camera} sends images, but there is no detector for them")
+
+    def _begin_anew(self) -> None:
+        """Time went back: poses are of another time, and the latest calibrations hold from now on."""
+        self.health.tell("time went back: everything began anew")
+        self._poses.clear()
+        for name, known in self._models.items():
+            self._models[name] = [(-np.inf, known[-1][1])]
 
     def _learn_camera(self, message: CameraModel) -> None:
         """A calibration that is new, or that changes in the middle.
@@ -265,6 +247,9 @@ class Fuser:
         self, source: str, message: Scan | Image, result: Any, error: Exception | None, spent: float, arrival: float
     ) -> None:
         """What a detector found, or that it failed."""
+        wanted = Detections3D if isinstance(message, Scan) else Detections2D
+        if error is None and not isinstance(result, wanted):
+            error = TypeError(f"it must give {wanted.__name__}, not {type(result).__name__}")
         if error is not None:
             self.health.failed(source, error)
             return
@@ -282,7 +267,8 @@ class Fuser:
         newest = self._poses.newest if self.settings.sync.poses else np.inf
         for group in self._sync.ready(frozenset(self._models), newest, everything):
             self._fuse(group)
-        self._show_to_watch(everything)
+        if self._feed is not None:
+            self._feed.advance(everything)
         if len(self._detect_ms) > 64:
             for key in list(self._detect_ms)[:-64]:
                 del self._detect_ms[key]
@@ -297,19 +283,35 @@ class Fuser:
         if error is not None:
             self.health.failed("fusion", error)
             return
-        result = replace(result, notes=(*result.notes, *self._notes(group, blinded)))
+        fused = perf_counter()
+        result = self._remember(frame, replace(result, notes=(*result.notes, *self._notes(group, blinded))))
         ended = perf_counter()
         latency = {
             "wait": (group.last_arrival - group.arrival) * 1e3,
-            "fusion": (ended - begun) * 1e3,
+            "fusion": (fused - begun) * 1e3,
+            **({} if self._memory_config is None else {"memory": (ended - fused) * 1e3}),
             "added": (ended - group.last_arrival) * 1e3,
             **self._detector_times(group),
         }
         live = LiveResult(group.time, frame, result, latency)
         self._results.append(live)
         if self._on_result is not None:
-            self._on_result(live)
+            _, error = attempt(self._on_result, live)
+            if error is not None:
+                self.health.failed("callback", error)
         self._look_after(group, frame, nominal, result, latency)
+
+    def _remember(self, frame: Frame, result: FusedDetections) -> FusedDetections:
+        """The result with what recent frames add; as it is where there is no memory, or where that fails."""
+        config = self._memory_config
+        if config is None:
+            return result
+        found, error = attempt(lambda fused: remember(self._memory, fused, frame, config), result)
+        if error is not None:
+            self.health.failed("memory", error)
+            return result
+        self._memory, remembered = found
+        return cast(FusedDetections, remembered)
 
     def _look_after(
         self, group: Group, frame: Frame, nominal: Frame, result: FusedDetections, latency: dict[str, float]
@@ -318,46 +320,8 @@ class Fuser:
         assert group.lidar is not None
         found = {name: part.detections for name, part in group.cameras.items() if name in self._models}
         self.health.fused(frame, result, found, latency, group.points)
-        if self.watch is not None and not 0 <= group.time - self._watched < 0.9 * self.settings.watch_period:
-            self._watched = group.time
-            self._unwatched.append((nominal, group.lidar, found))
-
-    def _show_to_watch(self, everything: bool) -> None:
-        """Show the watch what waits for it: for a time offset, once the car's motion up to the true moment is known."""
-        while self._unwatched:
-            frame = self._unwatched[0][0]
-            assert self.watch is not None
-            assert frame.timestamp is not None
-            if self.watch.settings.time and len(self._poses) and not everything:
-                ahead = max([0.0, *(self.watch.estimate(camera.name).time_offset for camera in frame.cameras)])
-                newer = self._watched - frame.timestamp
-                if self._poses.newest < frame.timestamp + ahead and newer <= LONGEST_OFFSET:
-                    return
-            self._observe(*self._unwatched.popleft())
-
-    def _observe(self, nominal: Frame, lidar: Detections3D, found: dict[str, Detections2D]) -> None:
-        """Show a moment to the watch: in real time in a thread of its own, where it skips what it has no time for."""
-        watch, time = self.watch, float(nominal.timestamp or 0.0)
-        assert watch is not None
-
-        def velocities(ahead: float) -> FloatArray | None:
-            with self._lock:
-                return self._relative_velocities(time, lidar, ahead)
-
-        def work(_: Any) -> None:
-            watch.observe(nominal, lidar, found, velocities)
-
-        if not self.settings.realtime:
-            work(None)
-            return
-
-        def done(_: Any, result: Any, error: Exception | None, spent: float) -> None:
-            if error is not None:
-                self.health.failed("watch", error)
-
-        if "watch" not in self._workers:
-            self._workers["watch"] = Worker("watch", lambda task: task(None), done)
-        self._workers["watch"].submit(work)
+        if self._feed is not None:
+            self._feed.offer(group.time, nominal, group.lidar, found)
 
     def _frame(self, group: Group) -> tuple[Frame, Frame]:
         """What is fused, with each camera as it stood at its own moment; and the same without corrections."""
@@ -386,17 +350,6 @@ class Fuser:
         motion = self._poses.motion(time, time + shift) if shift else None
         transform = camera.camera_from_lidar if motion is None else camera.camera_from_lidar @ motion
         return replace(camera, camera_from_lidar=transform, delay=shift)
-
-    def _relative_velocities(self, time: float, lidar: Detections3D, ahead: float) -> FloatArray | None:
-        """(N, 3) m/s of boxes as seen from the moving LiDAR, in its axes, on average over some seconds after a scan.
-
-        None without poses or the wish for it. Less than 50 ms are taken as the 50 ms before the scan.
-        """
-        if self.watch is None or not self.watch.settings.time:
-            return None
-        step = ahead if abs(ahead) > 0.05 else -0.05
-        motion = self._poses.motion(time, time + step)
-        return None if motion is None else relative_velocities(lidar, motion, step)
 
     def _notes(self, group: Group, blinded: Iterable[str]) -> list[str]:
         notes = [f"camera {n} sees far less than it used to and was not used" for n in sorted(blinded)]

@@ -55,6 +55,16 @@ class Stream:
         middle = float(np.median(steps)) if len(steps) > 1 else 0.0
         return 1 / middle if middle > 0 else float("nan")
 
+    @property
+    def delay(self) -> float:
+        """Median seconds from a message's time to its arrival, by clocks that may differ; infinite without any."""
+        return float(np.median(np.subtract(self.arrivals, self.stamps))) if self.stamps else float("inf")
+
+    @property
+    def delay_spread(self) -> float:
+        """Seconds by which the slowest twentieth is later than the median."""
+        return float(np.percentile(np.subtract(self.arrivals, self.stamps), 95)) - self.delay if self.stamps else 0.0
+
 
 class Health:
     """Counts and judges; see `diagnostics`.
@@ -186,7 +196,13 @@ class Health:
         return entries + [self._of_camera(name, sync, reports.get(name), hanging) for name in cameras]
 
     def _of_fusion(self, sync: Synchronizer) -> dict[str, Any]:
-        problems = [f"{self.errors['fusion']} frames could not be fused"] if self.errors["fusion"] else []
+        stages = {
+            "fusion": "frames could not be fused",
+            "memory": "frames went without memory",
+            "watch": "moments the watch failed at",
+            "callback": "results whose callback failed",
+        }
+        problems = [f"{self.errors[stage]} {what}" for stage, what in stages.items() if self.errors[stage]]
         values = {
             "frames": self.frames,
             "pending": sync.pending,
@@ -194,7 +210,7 @@ class Health:
             "latency_added_ms_median": self.percentile("added", 50),
             "latency_added_ms_p99": self.percentile("added", 99),
             "notes": "; ".join(self.notes),
-            "last_error": self.last_error.get("fusion", ""),
+            "last_error": "; ".join(self.last_error[stage] for stage in stages if stage in self.last_error),
         }
         return _entry("fusion", ERROR if problems else OK, problems, values)
 
@@ -256,6 +272,8 @@ class Health:
 
     def _values(self, sources: Sequence[str], sync: Synchronizer) -> dict[str, Any]:
         values: dict[str, Any] = {}
+        # clocks of sensors are not ours: delays are those beyond the quickest sensor's
+        quickest = min(s.delay for s in self._streams.values()) if self._streams else 0.0
         for source in sources:
             stream = self._streams.get(source)
             if stream is None:
@@ -263,6 +281,8 @@ class Health:
             prefix = "scan_" if source == "scan" else ""
             values[f"{prefix}messages"] = stream.count
             values[f"{prefix}rate_hz"] = stream.rate
+            values[f"{prefix}delay_ms"] = 1e3 * (stream.delay - quickest)
+            values[f"{prefix}delay_spread_ms"] = 1e3 * stream.delay_spread
             values[f"{prefix}backwards"] = stream.backwards
         values["dropped"] = sum(n for (source, _), n in sync.dropped.items() if source in sources)
         return values

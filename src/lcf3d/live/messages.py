@@ -37,11 +37,12 @@ class Image:
 
 @dataclass(frozen=True, eq=False)
 class CameraBoxes:
-    """2D detections of one camera at ``time``, that of their image."""
+    """2D detections of one camera at ``time``, that of their image; ``pixels`` are for those who look at the result."""
 
     time: float
     camera: str
     detections: Detections2D
+    pixels: NDArray[np.uint8] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,6 +71,19 @@ def source_of(message: Message) -> str:
     if isinstance(message, CameraModel):
         return f"calibration {message.camera.name}"
     return {Scan: "scan", LidarBoxes: "lidar", EgoPose: "pose"}[type(message)]
+
+
+def is_whole(message: Message) -> bool:
+    """Whether a message's data has the shape that it should: what was cut off on the way has not."""
+    if isinstance(message, Scan):
+        return np.ndim(message.points) == 2 and np.shape(message.points)[1] >= 3
+    if isinstance(message, Image):
+        return np.ndim(message.pixels) == 3 and np.shape(message.pixels)[2] == 3
+    if isinstance(message, EgoPose):
+        return np.shape(message.world_from_lidar) == (4, 4) and bool(np.isfinite(message.world_from_lidar).all())
+    if isinstance(message, LidarBoxes):
+        return isinstance(message.detections, Detections3D)
+    return not isinstance(message, CameraBoxes) or isinstance(message.detections, Detections2D)
 
 
 def same_mount(camera: Camera, other: Camera) -> bool:

@@ -46,6 +46,12 @@ class PoseBuffer:
         while self._times[0] < self._times[-1] - KEPT:
             del self._poses[self._times.pop(0)]
 
+    def clear(self) -> None:
+        """Forget everything, as when time begins anew."""
+        self._times.clear()
+        self._poses.clear()
+        self._answers.clear()
+
     def at(self, time: float) -> FloatArray | None:
         """(4, 4) ``world_from_lidar`` at a moment; None where no poses are near enough."""
         if time not in self._answers:

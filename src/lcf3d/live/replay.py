@@ -11,15 +11,17 @@ import numpy as np
 
 from lcf3d.datasets.base import CameraSource, Dataset, LidarSource
 from lcf3d.fusion.alignment_watch import WatchSettings
+from lcf3d.fusion.memory_config import MemoryConfig
 from lcf3d.fusion.pipeline import LateCascadeFusion
-from lcf3d.live.fuser import Fuser, LiveResult, LiveSettings
+from lcf3d.live.fuser import Fuser
 from lcf3d.live.messages import CameraBoxes, CameraModel, EgoPose, Image, LidarBoxes, Message, Scan
+from lcf3d.live.settings import LiveResult, LiveSettings
 from lcf3d.live.synchronizer import SyncSettings
 from lcf3d.run.sources import CameraOnImages, LidarOnScans
 from lcf3d.structures import Camera, Frame
 
-# frames that are further apart than this are of different drives: the replay waits this long between them (seconds)
-PAUSE = 1.0
+# between drives, and between frames further apart than this, the replay waits this long (seconds); longer than a memory
+PAUSE = 1.2
 
 
 @dataclass
@@ -71,6 +73,7 @@ def frame_messages(
     cameras: Mapping[str, CameraSource],
     known: dict[str, Camera],
     scans: bool,
+    shown: bool = False,
 ) -> Iterator[Message]:
     """The messages of one frame: calibrations that are new, the pose, the scan, the boxes or images.
 
@@ -81,6 +84,7 @@ def frame_messages(
         cameras: the camera branch by camera name, likewise.
         known: the calibrations pushed so far, kept up to date.
         scans: push the scan though no detector needs it, for recovery.
+        shown: somebody looks at the results: push scans and images too where nothing else needs them.
     """
     for camera in frame.cameras:
         if camera.name in cameras and not _same(camera, known.get(camera.name)):
@@ -89,7 +93,7 @@ def frame_messages(
     if frame.world_from_lidar is not None:
         yield EgoPose(moment, frame.world_from_lidar)
     on_scans = isinstance(lidar, LidarOnScans)
-    if (scans or on_scans) and frame.points is not None:
+    if (scans or on_scans or shown) and frame.points is not None:
         yield Scan(moment, frame.points)
     if not on_scans:
         yield LidarBoxes(moment, lidar.detect(frame))
@@ -99,7 +103,8 @@ def frame_messages(
         if isinstance(source, CameraOnImages):
             yield Image(moment, name, frame.images[name])
         else:
-            yield CameraBoxes(moment, name, source.detect(frame, name))
+            pixels = frame.images.get(name) if shown else None
+            yield CameraBoxes(moment, name, source.detect(frame, name), pixels)
 
 
 def _same(camera: Camera, other: Camera | None) -> bool:
@@ -120,6 +125,7 @@ def make_fuser(
     realtime: bool,
     correct: bool = False,
     watch: WatchSettings | None = None,
+    memory: MemoryConfig | None = None,
     on_result: Callable[[LiveResult], None] | None = None,
 ) -> Fuser:
     """The `Fuser` that belongs to two branches of a dataset."""
@@ -132,6 +138,7 @@ def make_fuser(
         lidar_detector=lidar.detector if isinstance(lidar, LidarOnScans) else None,
         camera_detectors={name: d for name, d in detectors.items() if name in {c.name for c in known}},
         settings=replace(LiveSettings(), sync=sync, realtime=realtime, watch=watch or WatchSettings(), correct=correct),
+        memory=memory,
         on_result=on_result,
     )
 
@@ -145,6 +152,7 @@ def replay(
     *,
     rate: float = 1.0,
     hertz: float = 10.0,
+    shown: bool = False,
     on_results: Callable[[list[LiveResult]], None] = lambda results: None,
 ) -> ReplayReport:
     """Push the frames of a dataset at their times and gather what comes of it.
@@ -157,19 +165,21 @@ def replay(
         fuser: where to push, see `make_fuser`.
         rate: so many times as fast as it was; 0 for as fast as possible.
         hertz: frames a second where the dataset has no times.
+        shown: whether images and scans are looked at, see `frame_messages`.
         on_results: called with the results after each frame.
     """
     report = ReplayReport()
     known: dict[str, Camera] = {}
     start = time.perf_counter()
-    before: float | None = None
+    before: Frame | None = None
     now = 0.0
     for frame_id in frame_ids:
         frame = dataset.frame(frame_id)
-        if report.frames:
-            now += frame_times([before, frame.timestamp], hertz)[1]
-        before = frame.timestamp
-        messages = list(frame_messages(frame, now, lidar, cameras, known, fuser.settings.sync.scans))
+        if before is not None:
+            same = before.sequence == frame.sequence
+            now += frame_times([before.timestamp, frame.timestamp], hertz)[1] if same else PAUSE
+        before = frame
+        messages = list(frame_messages(frame, now, lidar, cameras, known, fuser.settings.sync.scans, shown))
         if rate > 0:
             _wait_until(start + now / rate, report, fuser, on_results)
         for message in messages:

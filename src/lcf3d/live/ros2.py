@@ -17,8 +17,9 @@ from lcf3d.fusion.config import FusionConfig
 from lcf3d.fusion.pipeline import LateCascadeFusion
 from lcf3d.geometry.boxes import transform_boxes
 from lcf3d.geometry.rotation import transform_points
-from lcf3d.live.fuser import Fuser, LiveResult, LiveSettings
+from lcf3d.live.fuser import Fuser
 from lcf3d.live.messages import CameraBoxes, CameraModel, EgoPose, LidarBoxes, Message, Scan
+from lcf3d.live.settings import LiveResult, LiveSettings
 from lcf3d.live.synchronizer import SyncSettings
 from lcf3d.structures import Camera, FloatArray
 

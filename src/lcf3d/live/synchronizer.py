@@ -92,7 +92,7 @@ class Synchronizer:
 
     Attributes:
         dropped: how many messages were left out, by ``(source, cause)``; causes are ``late``, ``clock``,
-            ``duplicate``, ``broken`` (its time is no number) and ``overflow``.
+            ``duplicate``, ``broken`` (its time is no number, or its data has no such shape) and ``overflow``.
         clocks: seconds that the clock of a source is ahead of the LiDAR's, by source, where that is too much.
         closed: time of the newest group that was handed out.
         restarts: how often time went back by more than `CLOCK_LIMIT` and everything began anew.
@@ -128,6 +128,8 @@ class Synchronizer:
         elif self._newest_lidar is not None and abs(time - self._newest_lidar) > CLOCK_LIMIT:
             self.clocks.setdefault(source, time - self._newest_lidar)
             return self._drop(source, "clock")
+        else:
+            self.clocks.pop(source, None)
         self._watermark = time if of_lidar and time < self._watermark - CLOCK_LIMIT else max(self._watermark, time)
         return True
 

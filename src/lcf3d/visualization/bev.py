@@ -135,7 +135,7 @@ def _point_picture(points: NDArray[np.float32] | None, view: BevView) -> PIL.Ima
 
 @kernel
 def _highest(points, scale, column, row, low, high, levels):  # type: ignore[no-untyped-def]
-    """Raise each pixel of uint8 ``levels`` to that of its highest point: 1 up to ``low`` metres, 255 from ``high`` on."""
+    """Raise each pixel of uint8 ``levels`` to that of its highest point: 1 at ``low`` metres, 255 at ``high``."""
     for n in range(len(points)):
         x, y = column + points[n, 0] * scale, row - points[n, 1] * scale
         if x >= 0 and x < levels.shape[1] and y >= 0 and y < levels.shape[0]:

@@ -13,7 +13,7 @@ from lcf3d.errors import MissingExtraError
 from lcf3d.geometry.rotation import quaternions_from_yaws
 from lcf3d.provenance import FusedDetections
 from lcf3d.structures import Camera, Detections3D, FloatArray, Frame
-from lcf3d.visualization.scene import CAMERA_COLOUR, COLOURS, TRUTH_COLOUR, Scene
+from lcf3d.visualization.scene import CAMERA_COLOUR, COLOURS, TRUTH_COLOUR, Scene, drawn_dropped
 from lcf3d.visualization.trails import Trails
 
 _GREY = (110, 115, 120)
@@ -28,12 +28,13 @@ class RerunLog:
     Args:
         path: the ``.rrd`` file; without one the viewer is opened.
         cameras: names of the cameras, for the layout.
+        stream: whether latency, alignment and health come with the frames and get a place in the layout.
 
     Raises:
         MissingExtraError: rerun-sdk is not installed.
     """
 
-    def __init__(self, path: Path | None, cameras: Sequence[str]) -> None:
+    def __init__(self, path: Path | None, cameras: Sequence[str], *, stream: bool = False) -> None:
         try:
             import rerun
             import rerun.blueprint
@@ -46,10 +47,11 @@ class RerunLog:
         else:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._stream.save(path)
-        self._stream.send_blueprint(_blueprint(rerun.blueprint, cameras))
+        self._stream.send_blueprint(_blueprint(rerun.blueprint, cameras, stream))
         self._stream.log("world", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         self._index = 0
         self._trails = Trails()
+        self._messages: dict[str, str] = {}
 
     def log(
         self,
@@ -59,8 +61,11 @@ class RerunLog:
         truth: Detections3D | None = None,
         latency_ms: Mapping[str, float] | None = None,
         alignment_deg: Mapping[str, float] | None = None,
+        health: Sequence[Mapping[str, Any]] = (),
     ) -> None:
         """One frame: cameras with images and boxes, the scan coloured by what was decided, boxes with their reasons.
+
+        Where the boxes have tracks and the frame a pose, each has the way over ground that it came.
 
         Args:
             frame: the frame.
@@ -68,13 +73,16 @@ class RerunLog:
             truth: ground truth to draw, if any.
             latency_ms: milliseconds by stage, for the timeline.
             alignment_deg: how far each camera has turned against its calibration, by name, for the timeline.
+            health: of a stream, as `lcf3d.live.fuser.Fuser.diagnostics` gives it.
         """
         scene = Scene.from_fused(fused, truth, trails=self._trails(frame, fused))
         self._stream.set_time("frame", sequence=self._index)
         if frame.timestamp is not None:
             self._stream.set_time("time", duration=frame.timestamp)
         self._index += 1
-        self._log_boxes("world/boxes", scene.boxes, [COLOURS[o] for o in scene.outcomes], scene.texts)
+        reasons = [fused.explain(i) for i in range(len(fused))]
+        reasons += [fused.explain_lidar(int(i)) for i in drawn_dropped(fused)]
+        self._log_boxes("world/boxes", scene.boxes, [COLOURS[o] for o in scene.outcomes], reasons)
         if fused.tracks is not None:
             ways = [way for way in scene.trails if len(way) > 1]
             colours = [COLOURS[o] for o, way in zip(scene.outcomes, scene.trails, strict=False) if len(way) > 1]
@@ -85,7 +93,9 @@ class RerunLog:
         for camera in frame.cameras:
             self._log_camera(camera, frame, scene)
         self._log_masks(frame, fused)
-        self._log_texts_and_curves(fused, latency_ms or {}, alignment_deg or {})
+        self._log_reasons(fused, reasons[: len(fused)])
+        self._log_curves(fused, scene, latency_ms or {}, alignment_deg or {})
+        self._log_health(health)
 
     def close(self) -> None:
         """Write what is not yet written."""
@@ -160,17 +170,38 @@ class RerunLog:
                     part[mask.bitmap[: part.shape[0], : part.shape[1]]] = number % 255 + 1
             self._stream.log(f"world/cameras/{name}/image/masks", self._rerun.SegmentationImage(picture, opacity=0.4))
 
-    def _log_texts_and_curves(
-        self, fused: FusedDetections, latency_ms: Mapping[str, float], alignment_deg: Mapping[str, float]
-    ) -> None:
-        lines = [f"- {fused.explain(i)}" for i in range(len(fused))] + [f"- *{note}*" for note in fused.notes]
+    def _log_reasons(self, fused: FusedDetections, reasons: Sequence[str]) -> None:
+        lines = [f"- {reason}" for reason in reasons] + [f"- *{note}*" for note in fused.notes]
         self._stream.log("reasons", self._rerun.TextDocument("\n".join(lines) or "nothing", media_type="text/markdown"))
+
+    def _log_curves(
+        self, fused: FusedDetections, scene: Scene, latency_ms: Mapping[str, float], alignment_deg: Mapping[str, float]
+    ) -> None:
         scores = fused.detections.scores
-        curves = {"scores/highest": float(scores.max()) if len(scores) else 0.0, "scores/boxes": float(len(scores))}
+        curves = {"scores/highest": float(scores.max()) if len(scores) else 0.0}
+        curves["scores/median"] = float(np.median(scores)) if len(scores) else 0.0
+        # every outcome at every frame: a curve that stops would look as if it went on
+        curves |= {f"boxes/{outcome}": float(scene.outcomes.count(outcome)) for outcome in COLOURS}
         curves |= {f"latency/{part}": value for part, value in latency_ms.items()}
         curves |= {f"alignment/{camera}": value for camera, value in alignment_deg.items()}
         for entity, value in curves.items():
             self._stream.log(entity, self._rerun.Scalars(value))
+
+    def _log_health(self, health: Sequence[Mapping[str, Any]]) -> None:
+        """Level of every part (0 ok, 1 warning, 2 error, 3 silent) and shares of confirmed boxes as curves; a line of
+        text where what is said of a part changes."""
+        levels = ("INFO", "WARN", "ERROR", "ERROR")
+        for status in health:
+            part = str(status["hardware_id"]).removeprefix("camera ")
+            self._stream.log(f"health/{part}", self._rerun.Scalars(float(status["level"])))
+            values = {entry["key"]: entry["value"] for entry in status["values"]}
+            share = float(values.get("confirmed_share", "nan"))
+            if np.isfinite(share):
+                self._stream.log(f"confirmed/{part}", self._rerun.Scalars(share))
+            if self._messages.get(part) != status["message"]:
+                self._messages[part] = status["message"]
+                line = self._rerun.TextLog(f"{part}: {status['message']}", level=levels[status["level"]])
+                self._stream.log("events", line)
 
 
 def point_colours(points: NDArray[np.float32], scene: Scene) -> NDArray[np.uint8]:
@@ -186,21 +217,22 @@ def point_colours(points: NDArray[np.float32], scene: Scene) -> NDArray[np.uint8
     return colours
 
 
-def _blueprint(blueprint: Any, cameras: Sequence[str]) -> Any:
-    """Scan and boxes beside the reasons; cameras below; curves of scores, latency and alignment at the bottom."""
+def _blueprint(blueprint: Any, cameras: Sequence[str], stream: bool) -> Any:
+    """Scan and boxes beside the reasons; cameras below; curves at the bottom, of a stream beside what happened."""
     views = [
         blueprint.Spatial2DView(origin=f"world/cameras/{name}/image", name=name, contents="$origin/**")
         for name in cameras
     ]
-    curves = [
-        blueprint.TimeSeriesView(origin=name, name=name.capitalize()) for name in ("scores", "latency", "alignment")
-    ]
+    names = ["scores", "boxes", *(["latency", "alignment", "health", "confirmed"] if stream else [])]
+    curves = [blueprint.TimeSeriesView(origin=name, name=name.capitalize()) for name in names]
+    reasons = blueprint.TextDocumentView(origin="reasons", name="Reasons")
+    beside = (
+        [blueprint.Vertical(reasons, blueprint.TextLogView(origin="events", name="Health"))] if stream else [reasons]
+    )
     return blueprint.Blueprint(
         blueprint.Vertical(
             blueprint.Horizontal(
-                blueprint.Spatial3DView(origin="world", name="Scan and boxes"),
-                blueprint.TextDocumentView(origin="reasons", name="Reasons"),
-                column_shares=[3, 1],
+                blueprint.Spatial3DView(origin="world", name="Scan and boxes"), *beside, column_shares=[3, 1]
             ),
             *([blueprint.Horizontal(*views)] if views else []),
             blueprint.Horizontal(*curves),

@@ -115,8 +115,7 @@ class Scene:
             trails: where each output has been, see `lcf3d.visualization.trails`.
         """
         outcomes = fused.origins
-        dropped = fused.dropped_lidar
-        dropped = dropped[~np.isin(fused.lidar.reason[dropped], _NOT_DRAWN)]
+        dropped = drawn_dropped(fused)
         dropped = dropped[fused.lidar_inputs.scores[dropped] >= least_score]
         shown = np.flatnonzero(fused.detections.scores >= least_score)
         numbers = None if fused.tracks is None else fused.tracks.ids[shown]
@@ -128,6 +127,12 @@ class Scene:
             None if truth is None else truth.boxes,
             [trails[int(i)] for i in shown] if trails else (),
         )
+
+
+def drawn_dropped(fused: FusedDetections) -> IntArray:
+    """Indices of the LiDAR detections that were candidates and were dropped; they are drawn after the outputs."""
+    dropped = fused.dropped_lidar
+    return dropped[~np.isin(fused.lidar.reason[dropped], _NOT_DRAWN)]
 
 
 def _image_boxes(fused: FusedDetections, least_score: float) -> dict[str, ImageBoxes]:
