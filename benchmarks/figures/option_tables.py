@@ -35,7 +35,7 @@ EXTRAS = {
     "simulate": "simulated streets and drives",
     "sparse": "spconv for the LiDAR networks with sparse convolutions on a GPU; they run without it",
     "formats": "`.las`, `.pcd`, parquet, Argoverse 2's feather files, data frames",
-    "fleet": "results as parquet tables",
+    "fleet": "results as parquet tables; buckets and archives; Ray clusters",
     "serve": "the report of all frames, served on this machine",
     "docs": "to build these pages",
     "dev": "all of them, and what the tests need",

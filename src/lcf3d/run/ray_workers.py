@@ -198,7 +198,8 @@ def _connected(address: str) -> tuple[Any, bool]:
             logging_level="ERROR",
             **({} if address != "auto" else {"include_dashboard": False}),
         )
-    except Exception as error:
+    except (Exception, SystemExit) as error:
+        # Ray leaves the program where its own servers do not start in time
         said = (str(error).strip() or type(error).__name__).splitlines()[0]
         where = f"the Ray cluster at {address} cannot be used"
         if address == "auto":
