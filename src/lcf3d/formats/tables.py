@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lcf3d.errors import FormatError, MissingExtraError
-from lcf3d.files import atomic_path
+from lcf3d.files import atomic_path, reading, require_file, shortened
 from lcf3d.structures import Detections2D, Detections3D
 
 BOX_3D = ("x", "y", "z", "length", "width", "height", "yaw")
@@ -95,20 +95,25 @@ def _write(path: Path, columns: Mapping[str, list[Any]]) -> None:
 
 
 def _read(path: Path, texts: Sequence[str], numbers: Sequence[str]) -> dict[str, NDArray[Any]]:
-    arrow, parquet = _parquet("reading parquet tables")
+    _, parquet = _parquet("reading parquet tables")
+    if not path.exists():
+        raise FormatError(f"{path} does not exist")
+    require_file(path)
     try:
-        table = parquet.read_table(path)
-    except FileNotFoundError:
-        raise FormatError(f"{path} does not exist") from None
-    except (arrow.ArrowInvalid, OSError) as error:
-        raise FormatError(f"{path} cannot be read as a parquet table ({str(error).splitlines()[0]})") from None
+        with reading(path, "a parquet table"):
+            table = parquet.read_table(path)
+            # what is damaged would be read beyond its end
+            table.validate(full=True)
+    except OSError as error:
+        raise FormatError(f"{path} cannot be read as a parquet table ({shortened(error)})") from None
     absent = [name for name in (*texts, *numbers) if name not in table.column_names]
     if absent:
         raise FormatError(f"{path} has no column {', '.join(absent)}; it holds {', '.join(table.column_names)}")
     found: dict[str, NDArray[Any]] = {}
     try:
-        for name in texts:
-            found[name] = np.array([str(value) for value in table[name].to_pylist()], dtype=np.str_)
+        with reading(path, "a parquet table"):
+            for name in texts:
+                found[name] = np.array([str(value) for value in table[name].to_pylist()], dtype=np.str_)
         for name in (*numbers, *(("score",) if "score" in table.column_names else ())):
             found[name] = np.array(table[name].to_pylist(), dtype=np.float64)
     except (TypeError, ValueError):

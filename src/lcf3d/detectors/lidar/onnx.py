@@ -15,6 +15,7 @@ from lcf3d.detectors.lidar.grounding import ground_of, grounded, levelled
 from lcf3d.detectors.lidar.inputs import encoder_inputs, map_detections
 from lcf3d.detectors.lidar.suppression import NmsMode, suppression_threshold
 from lcf3d.errors import ConfigError, DetectorError
+from lcf3d.files import shortened
 from lcf3d.networks.onnx import open_session
 from lcf3d.structures import Detections3D
 
@@ -51,7 +52,11 @@ class OnnxLidarDetector:
         metadata = self._session.get_modelmeta().custom_metadata_map
         if CONFIG_KEY not in metadata:
             raise DetectorError(f"{path} was not exported by lcf3d: it holds no {CONFIG_KEY}")
-        config = LidarConfig.from_dict(json.loads(metadata[CONFIG_KEY]))
+        try:
+            settings = json.loads(metadata[CONFIG_KEY])
+        except (ValueError, RecursionError) as error:
+            raise DetectorError(f"{path}: its {CONFIG_KEY} is damaged ({shortened(error)}); export it again") from None
+        config = LidarConfig.from_dict(settings)
         self.config = config if candidates is None else config.with_candidates(candidates)
         self.nms = nms
         self.score_threshold = self.config.suppression.score_threshold if score_threshold is None else score_threshold
