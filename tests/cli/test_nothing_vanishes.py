@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from lcf3d.api import evaluate, run
-from lcf3d.datasets.kitti import KittiDataset, read_calibration
+from lcf3d.datasets.kitti import KittiDataset
+from lcf3d.datasets.kitti_calibration import read_calibration
 from lcf3d.datasets.opening import check_dataset
 from lcf3d.errors import DatasetError, FormatError
 from tests.datasets.kitti_folder import calibration_text, make_kitti, make_results

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from lcf3d.datasets.kitti import KittiCalibration
+from lcf3d.datasets.kitti_calibration import KittiCalibration
 from lcf3d.evaluation.kitti import KittiEvaluator
 from lcf3d.evaluation.kitti_breakdown import compare
 from lcf3d.evaluation.kitti_study import study

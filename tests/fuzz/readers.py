@@ -223,7 +223,7 @@ READERS: dict[str, Reader] = {
         "a.txt", _text(f"0 1 {LABEL}\n" * 3), call("lcf3d.formats.kitti_drives:read_tracking_labels"), mutate_bytes
     ),
     "kitti calibration": Reader(
-        "a.txt", _text(calibration_text()), call("lcf3d.datasets.kitti:read_calibration"), mutate_bytes
+        "a.txt", _text(calibration_text()), call("lcf3d.datasets.kitti_calibration:read_calibration"), mutate_bytes
     ),
     "kitti split": Reader("a.txt", _text("000001\n000002\n"), call("lcf3d.formats.kitti:read_frame_ids"), mutate_bytes),
     "kitti scan": Reader(

@@ -1,14 +1,15 @@
 """KITTI object layout: ``ROOT/training/{calib,image_2,image_3,velodyne,label_2}`` and ``ROOT/ImageSets/SPLIT.txt``.
 
-Any subset of the sensor folders may be there. Camera ``left`` is the left colour camera (``image_2``, ``P2``) and
-``right`` the right one (``image_3``, ``P3``). The LiDAR frame is the Velodyne's: x forward, y left, z up already.
+Any subset of the sensor folders may be there. Frames cut from a raw drive may keep the calibration of its day
+(``calib_cam_to_cam.txt`` and ``calib_velo_to_cam.txt`` in ``training/calib``, ``training`` or the root) for all of
+them. Camera ``left`` is the left colour camera (``image_2``, ``P2``) and ``right`` the right one (``image_3``, ``P3``).
+The LiDAR frame is the Velodyne's: x forward, y left, z up already.
 """
 
 from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
@@ -18,9 +19,10 @@ from numpy.typing import NDArray
 from lcf3d.datasets.base import BaseDataset, CameraSource, LidarSource, ResultWriter, require_folder
 from lcf3d.datasets.check import Finding
 from lcf3d.datasets.images import ImageFiles, image_size
+from lcf3d.datasets.kitti_calibration import RAW_CAMERAS, KittiCalibration, read_calibration, read_raw_calibration
 from lcf3d.datasets.kitti_sequences import FRAMES_PER_S, lidar_pose, sequence_of
 from lcf3d.errors import ConfigError, DatasetError, FormatError
-from lcf3d.files import list_files, read_text, shortened
+from lcf3d.files import list_files, shortened
 from lcf3d.formats.kitti import detections_3d, read_frame_ids, read_objects
 from lcf3d.formats.kitti_drives import read_camera_poses
 from lcf3d.formats.scans import read_scan, unit_intensity
@@ -42,96 +44,6 @@ NEAR_MIDDLE = 0.1
 PARTS = ("training", "testing")
 SCANS = (".bin", ".npy")
 IMAGES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".ppm")
-
-
-@dataclass(frozen=True, eq=False)
-class KittiCalibration:
-    """What a KITTI calibration file says.
-
-    Attributes:
-        projections: (3, 4) by name ``P0`` to ``P3``, pixels from the rectified reference camera.
-        camera_from_lidar: (4, 4) rectified reference camera from Velodyne, ``R0_rect @ Tr_velo_to_cam``.
-        lidar_from_imu: (4, 4) Velodyne from the GPS/IMU unit, or None where the file does not say.
-    """
-
-    projections: Mapping[str, FloatArray]
-    camera_from_lidar: FloatArray
-    lidar_from_imu: FloatArray | None = None
-
-
-def read_calibration(path: Path) -> KittiCalibration:
-    """Read a calibration file; spellings of the object, tracking and odometry benchmarks are understood.
-
-    Raises:
-        DatasetError: the file does not exist.
-        FormatError: an entry is missing or malformed; names it.
-    """
-    entries = read_entries(path)
-    rectification, reference_from_lidar = np.eye(4), np.eye(4)
-    if "Tr" in entries:
-        # odometry: from the Velodyne to the rectified reference camera at once
-        reference_from_lidar[:3] = matrix_entry(path, entries, ("Tr",), (3, 4))
-    else:
-        rectification[:3, :3] = matrix_entry(path, entries, ("R0_rect", "R_rect"), (3, 3))
-        reference_from_lidar[:3] = matrix_entry(path, entries, ("Tr_velo_to_cam", "Tr_velo_cam"), (3, 4))
-    projections: dict[str, FloatArray] = {"P2": matrix_entry(path, entries, ("P2",), (3, 4))}
-    others: tuple[str, ...] = ("P0", "P1", "P3")
-    for name in others:
-        if name in entries:
-            projections[name] = matrix_entry(path, entries, (name,), (3, 4))
-    for name in ("P2", "P3"):
-        if name in projections and not (projections[name][0, 0] > 0 and projections[name][1, 1] > 0):
-            raise FormatError(f"{path}: {name} has no focal length; expected the projection of a camera")
-    lidar_from_imu = None
-    if "Tr_imu_to_velo" in entries or "Tr_imu_velo" in entries:
-        lidar_from_imu = np.eye(4)
-        lidar_from_imu[:3] = matrix_entry(path, entries, ("Tr_imu_to_velo", "Tr_imu_velo"), (3, 4))
-    return KittiCalibration(projections, rectification @ reference_from_lidar, lidar_from_imu)
-
-
-# lines of raw drives that say when and how it was calibrated
-NOT_NUMBERS = ("calib_time", "corner_dist")
-
-
-def read_entries(path: Path, skip: Sequence[str] = ()) -> dict[str, FloatArray]:
-    """The numbers of a calibration file by the name that begins each line, but for the names in ``skip``.
-
-    Raises:
-        DatasetError: the file does not exist.
-        FormatError: a line is malformed; names it.
-    """
-    try:
-        text = read_text(path)
-    except DatasetError:
-        raise DatasetError(f"calibration file {path} does not exist") from None
-    entries: dict[str, FloatArray] = {}
-    for number, line in enumerate(text.splitlines(), 1):
-        name, *fields = line.replace(":", " ").split() or [""]
-        if name in skip or name in NOT_NUMBERS:
-            continue
-        try:
-            entries[name] = np.array([float(f) for f in fields])
-        except ValueError:
-            raise FormatError(f"{path}:{number}: {name} must be followed by numbers") from None
-        if not np.isfinite(entries[name]).all():
-            raise FormatError(f"{path}:{number}: {name} holds NaN or infinite values")
-    return entries
-
-
-def matrix_entry(
-    path: Path, entries: Mapping[str, FloatArray], names: Sequence[str], shape: tuple[int, int]
-) -> FloatArray:
-    """The matrix under the first of ``names`` that the file at ``path`` has.
-
-    Raises:
-        FormatError: it has none of them, or of another size.
-    """
-    for name in names:
-        if name in entries:
-            if entries[name].size != shape[0] * shape[1]:
-                raise FormatError(f"{path}: {name} must hold {shape[0] * shape[1]} numbers, got {entries[name].size}")
-            return entries[name].reshape(shape)
-    raise FormatError(f"{path} has no entry {' or '.join(names)}")
 
 
 def read_points(path: Path) -> NDArray[np.float32]:
@@ -321,7 +233,11 @@ class KittiDataset(KittiLikeDataset):
         there = [part for part in PARTS if (self.root / part).is_dir()] or list(PARTS)
         if self.split is not None and self.split.lower().startswith("test"):
             there.reverse()
-        return max(there, key=lambda part: sum((self.root / part / "calib" / f"{i}.txt").is_file() for i in listed))
+        # frames cut from a raw drive have no calibration files of their own
+        names = ("calib/{}.txt", "velodyne/{}.bin", "image_2/{}.png")
+        return max(
+            there, key=lambda part: sum(any((self.root / part / n.format(i)).is_file() for n in names) for i in listed)
+        )
 
     def _split_path(self, split: str) -> Path:
         path = self.root / "ImageSets" / f"{split}.txt"
@@ -331,10 +247,24 @@ class KittiDataset(KittiLikeDataset):
         return path
 
     def _all_ids(self) -> tuple[str, ...]:
-        ids = tuple(p.stem for p in list_files(self.folder / "calib", ".txt"))
+        ids: tuple[str, ...] = tuple(sorted(self._calibrated))
+        if not ids and self._raw is not None:
+            ids = tuple(sorted({*self._present["velodyne"], *self._present["image_2"]}))
         if not ids:
             raise DatasetError(f"{self.folder / 'calib'} holds no calibration files")
         return ids
+
+    @cached_property
+    def _calibrated(self) -> frozenset[str]:
+        """Frames that have a calibration file of their own."""
+        return frozenset(p.stem for p in list_files(self.folder / "calib", ".txt") if not p.name.startswith("calib_"))
+
+    @cached_property
+    def _raw(self) -> tuple[KittiCalibration, dict[str, tuple[int, int]]] | None:
+        """Calibration and image sizes of the recording day, for the frames that have none of their own."""
+        folders = (self.folder / "calib", self.folder, self.root)
+        found = next((folder for folder in folders if (folder / RAW_CAMERAS).is_file()), None)
+        return None if found is None else read_raw_calibration(found)
 
     @cached_property
     def _present(self) -> dict[str, dict[str, Path]]:
@@ -348,16 +278,17 @@ class KittiDataset(KittiLikeDataset):
         Raises:
             DatasetError: some have none; says how many and which first.
         """
-        present = {p.stem for p in list_files(self.folder / "calib", ".txt")}
-        absent = [frame_id for frame_id in frame_ids if frame_id not in present]
-        if absent:
+        absent = [frame_id for frame_id in frame_ids if frame_id not in self._calibrated]
+        if absent and self._raw is None:
             raise DatasetError(
                 f"{self.folder / 'calib'} lacks {len(absent)} of {len(frame_ids)} frames, first {absent[0]}.txt; "
                 "copy the calibration files or leave those frames out of the split"
             )
 
     def calibration(self, frame_id: str) -> KittiCalibration:
-        """The calibration of a frame."""
+        """The calibration of a frame, or of the recording day where the frame has none of its own."""
+        if self._raw is not None and frame_id not in self._calibrated:
+            return self._raw[0]
         return read_calibration(self.folder / "calib" / f"{frame_id}.txt")
 
     def image_paths(self, frame_id: str) -> dict[str, Path]:
@@ -391,7 +322,7 @@ class KittiDataset(KittiLikeDataset):
         return Frame(
             frame_id,
             points=(lambda: read_points(scan)) if scan else None,
-            cameras=cameras_of(calibration, images, {}, self.default_image_size),
+            cameras=cameras_of(calibration, images, self._raw[1] if self._raw else {}, self.default_image_size),
             images=ImageFiles(images),
             labels=labels if label else None,
             timestamp=None if sequence is None else number / FRAMES_PER_S,
