@@ -226,7 +226,7 @@ def _bag(path: Path) -> None:
         )
         for i in range(2)
     ]
-    write_bag(path, frames)
+    write_bag(frames, path)
 
 
 def _read_bag(path: Path) -> None:
