@@ -34,8 +34,9 @@ from lcf3d.simulation.scene import build_scene
 from lcf3d.structures import KITTI_CLASSES, Camera, Detections3D, Frame
 
 SEED = 3201
-PRESETS = ("kitti64", "sparse16", "nuscenes32")
-CAMERA_SETTINGS = {"kitti64": "", "sparse16": "", "nuscenes32": "?size=448x800"}
+PRESETS = ("kitti64", "sparse16", "nuscenes32", "rain", "night")
+# about as many pixels to a degree as KITTI's images have
+CAMERA_SETTINGS = {"nuscenes32": "?size=544x960"}
 
 
 def simulated(preset_name: str, frames: int) -> Iterator[Frame]:
@@ -51,7 +52,7 @@ def simulated(preset_name: str, frames: int) -> Iterator[Frame]:
 def run(preset_name: str, frames: int) -> dict[str, list[float]]:
     """Values of the table's columns by method."""
     domain = find_domain("nuscenes" if preset_name == "nuscenes32" else "kitti")
-    camera = load_detector(f"shipped:kitti{CAMERA_SETTINGS[preset_name]}", "camera", KITTI_CLASSES)
+    camera = load_detector(f"shipped:kitti{CAMERA_SETTINGS.get(preset_name, '')}", "camera", KITTI_CLASSES)
     networks = {mode: load_detector(f"shipped:kitti?nms={mode}", "lidar", KITTI_CLASSES) for mode in ("keep", "off")}
     fusions = {f"fused, {name}": LateCascadeFusion(FusionConfig.preset(name)) for name in ("paper", "kitti")}
     truths: list[Truth] = []

@@ -3,7 +3,7 @@
     python benchmarks/when_fusion_helps.py /data --plots docs/images
 
 ``/data`` holds ``kitti`` and ``kitti_tracking`` with results of the detectors named in ``PAIRS``. Prints one table (or
-``--json``): the LiDAR branch alone, the paper's filter, the ``kitti`` preset without labels (``--calibration auto``),
+``--json``): the LiDAR branch alone, a hard filter, the ``kitti`` preset without labels (``--calibration auto``),
 the same with a calibration in cross-validation, and with evidence weights fitted on the other folder. The plots show
 what happens as either branch gets worse: noise is added to LiDAR scores, or camera detections are taken away.
 """
@@ -88,7 +88,7 @@ def table(studies: dict[Pair, CalibrationStudy]) -> list[dict[str, object]]:
         others = [fitted[p].evidence for p in studies if p.folder != pair.folder]
         elsewhere = fitted[pair].model_copy(update={"evidence": {k: v for e in others for k, v in e.items()}})
         ways = {
-            "paper's filter": fuse(study, *branches, FILTER),
+            "hard filter": fuse(study, *branches, FILTER),
             "kitti preset, no labels": fuse(study, *branches, PRESET),
             "evidence of the other folder": fuse(study, *branches, PRESET, elsewhere),
         }
@@ -150,7 +150,7 @@ def altered(
 def sweep_chart(study: CalibrationStudy, class_name: str, worse: str) -> str:
     """3D AP moderate as one branch gets worse; calibration is fitted on the frames it is used on."""
     amounts = np.linspace(0, 2, 5) if worse == "lidar" else np.linspace(0, 0.8, 5)
-    curves: dict[str, list[float]] = {ALONE: [], "paper's filter": [], "kitti preset, no labels": [], "calibrated": []}
+    curves: dict[str, list[float]] = {ALONE: [], "hard filter": [], "kitti preset, no labels": [], "calibrated": []}
     for amount in amounts:
         at = noisy_lidar(study, amount) if worse == "lidar" else thinned_camera(study, amount)
         ways = ((None, None), (FILTER, None), (PRESET, None), (PRESET, at.fit()))

@@ -1,6 +1,8 @@
 """Fixtures that several test folders use."""
 
 import os
+import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -24,3 +26,18 @@ def shared() -> Path:
     if not (SHARED / "data").is_dir():
         pytest.skip("../shared/data is absent")
     return SHARED
+
+
+@pytest.fixture
+def refused_by(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
+    """What the command says; it is to end with code 2."""
+    from lcf3d.cli.app import main
+
+    def call(*arguments: object) -> str:
+        monkeypatch.setattr(sys, "argv", ["lcf3d", *map(str, arguments)])
+        with pytest.raises(SystemExit) as ended:
+            main()
+        assert ended.value.code == 2
+        return "\n".join(line for line in capsys.readouterr().err.splitlines() if not line.startswith("note:"))
+
+    return call

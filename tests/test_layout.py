@@ -11,7 +11,7 @@ import lcf3d
 ROOT = Path(lcf3d.__file__).parent
 FLOORS = (
     ("errors",),
-    ("distortion", "converters", "structures", "files", "provenance", "plugins", "processes", "kernels"),
+    ("distortion", "converters", "structures", "files", "provenance", "plugins", "processes", "kernels", "remote"),
     ("geometry",),
     ("networks",),
     ("fusion",),

@@ -34,7 +34,7 @@ def test_the_tutorial_runs_as_it_stands(tmp_path, monkeypatch, capsys):
     (root / "sensors.yaml").unlink()
     monkeypatch.chdir(tmp_path)
     outputs = {}
-    for number, block in enumerate(blocks("bash")):
+    for number, block in enumerate(blocks("sh")):
         for command in block.strip().splitlines():
             name, *arguments = shlex.split(command)
             assert name == "lcf3d"

@@ -10,8 +10,6 @@ import pytest
 import lcf3d
 
 DOCS = Path(__file__).parents[1] / "docs"
-# pages for those who change a network or read a paper beside the code
-DEEP = {"detectors-lidar.md", "simulation.md", "train-camera.md", "train-lidar.md", "rivals.md", "clocs.md"}
 
 
 def test_every_name_is_there_and_listed():
@@ -33,7 +31,7 @@ def test_run_is_a_package_and_a_function():
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
-@pytest.mark.parametrize("page", sorted(p.name for p in DOCS.glob("*.md") if p.name not in DEEP))
+@pytest.mark.parametrize("page", sorted(p.name for p in DOCS.glob("*.md")))
 def test_pages_import_from_the_top(page):
     deep = re.findall(r"^\s*(?:from|import) (lcf3d\.[\w.]+)", (DOCS / page).read_text(), re.MULTILINE)
     assert deep == []
@@ -72,3 +70,26 @@ def test_arrays_in_python_give_what_the_command_line_gives(tmp_path, monkeypatch
     measured = lcf3d.evaluate(f"toy:{tmp_path / 'data'}", tmp_path / "fused")
     assert measured.to_json()["mean_ap"] > 0.9
     assert lcf3d.draw(dataset.frame("f00"), lcf3d.read_run(tmp_path / "fused")["f00"]).size[0] > 100
+
+
+def test_paths_may_be_text(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    frame = lcf3d.demo_frames(1)[0]
+    lcf3d.write_kitti([frame], "kitti", camera="left")
+    lcf3d.write_nuscenes([frame], "nuscenes", cameras={"left": "CAM_FRONT"})
+    lcf3d.write_folder([frame], "folder", image_format="jpg")
+    lcf3d.write_bag([frame], "drive.mcap")
+    lcf3d.write_detections_3d("boxes.json", frame.labels)
+    assert len(lcf3d.read_detections_3d("boxes.json")) == len(frame.labels)
+    dataset = lcf3d.NuscenesDataset("nuscenes")
+    dataset.write_results("results.json", {dataset.ids[0]: dataset[0].labels})
+    assert len(dataset.read_results("results.json")[dataset.ids[0]]) == len(dataset[0].labels) > 5
+
+
+def test_frames_of_the_demo():
+    frames = lcf3d.demo_frames(2)
+    assert [frame.timestamp for frame in frames] == [0.0, 0.1]
+    thinned = lcf3d.demo_frames(1, beam_step=4)[0]
+    assert 0.2 < len(thinned.points) / len(frames[0].points) < 0.3
+    assert thinned.images["left"].shape == (375, 1242, 3)
+    assert set(frames[0].labels.class_names) == {"Car", "Pedestrian", "Cyclist"}

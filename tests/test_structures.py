@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 
 from lcf3d import Camera, Detections2D, Detections3D, Frame
 from lcf3d.errors import ConfigError, ShapeError
-from lcf3d.structures import InstanceMask
+from lcf3d.structures import InstanceMask, with_columns
 
 NAMES = ("car", "person")
 BOX = [10.0, 2, -1, 4, 2, 1.5, 0.1]
@@ -108,3 +108,29 @@ def test_a_mask_keeps_the_part_that_holds_something():
     image[2:4, 3:6] = True
     mask = InstanceMask.from_image(image)
     assert mask.contains(np.array([[3.5, 2.5], [0.5, 0.5], [5.5, 3.5]])).tolist() == [True, False, True]
+
+
+def test_what_is_made_of_detections_stays_read_only_and_says_what_does_not_fit():
+    found = Detections3D([BOX, BOX, BOX], [0.1, 0.2, 0.3], [0, 1, 0], NAMES, velocities=np.ones((3, 2)))
+    made = [found[1:], found[[2, 0]], found[found.scores > 0.1], found.with_classes(("person",))]
+    made += [Detections3D.concatenate([found, found]), with_columns(found, scores=np.ones(3))]
+    for one in made:
+        for column in (one.boxes, one.scores, one.labels, one.velocities):
+            assert not column.flags.writeable
+            assert len(column) == len(one)
+    assert found.with_classes(NAMES) is found
+    assert made[-1].scores.tolist() == [1, 1, 1]
+    with pytest.raises(ShapeError, match=r"boxes must have shape \(N, 7\), got \(7,\)"):
+        found[0]
+    with pytest.raises(ShapeError, match=r"boxes must have shape \(N, 4\), got \(4,\)"):
+        Detections2D([[0, 0, 1, 1]], [0.1], [0], NAMES)[0]
+
+
+def test_arrays_that_nobody_can_change_are_shared():
+    found = Detections3D([BOX], [0.1], [0], NAMES)
+    again = Detections3D(found.boxes, found.scores, found.labels, NAMES)
+    assert again.boxes is found.boxes
+    view = np.array([BOX])[:]
+    view.setflags(write=False)
+    # its base can still be written to
+    assert Detections3D(view, [0.1], [0], NAMES).boxes is not view

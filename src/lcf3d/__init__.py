@@ -28,7 +28,9 @@ if TYPE_CHECKING:
     from lcf3d.datasets.kitti import KittiDataset
     from lcf3d.datasets.nuscenes import NuscenesDataset
     from lcf3d.datasets.opening import open_dataset
+    from lcf3d.demo.drive import demo_frames
     from lcf3d.detectors.classes import to_classes
+    from lcf3d.detectors.lidar.export import export_onnx
     from lcf3d.detectors.named import load_detector
     from lcf3d.evaluation.domain_shift import DOMAINS, adapt_points
     from lcf3d.evaluation.generalization import evaluate_generalization
@@ -36,6 +38,7 @@ if TYPE_CHECKING:
     from lcf3d.formats.plain import read_detections_2d, read_detections_3d, write_detections_2d, write_detections_3d
     from lcf3d.fusion.alignment_watch import AlignmentWatch, WatchSettings
     from lcf3d.fusion.calibration import Calibration
+    from lcf3d.fusion.clocs import ClocsFusion
     from lcf3d.fusion.config import FusionConfig
     from lcf3d.fusion.evidence import Evidence
     from lcf3d.fusion.memory import remember_sequence
@@ -49,6 +52,7 @@ if TYPE_CHECKING:
     from lcf3d.localizers.named import load_localizer
     from lcf3d.localizers.shapes import SHAPES, ObjectShape
     from lcf3d.provenance import FusedDetections, Outcome, Reason
+    from lcf3d.simulation.frames import simulate_drive, simulate_frame
 
 try:
     __version__ = version("lcf3d")
@@ -70,6 +74,7 @@ _LAZY = {
     "WatchSettings": "fusion.alignment_watch",
     "BaseDataset": "datasets.base",
     "Calibration": "fusion.calibration",
+    "ClocsFusion": "fusion.clocs",
     "Dataset": "datasets.base",
     "Evidence": "fusion.evidence",
     "FusedDetections": "provenance",
@@ -86,9 +91,11 @@ _LAZY = {
     "ObjectShape": "localizers.shapes",
     "SHAPES": "localizers.shapes",
     "adapt_points": "evaluation.domain_shift",
+    "demo_frames": "demo.drive",
     "draw": "api",
     "evaluate_generalization": "evaluation.generalization",
     "evaluate": "api",
+    "export_onnx": "detectors.lidar.export",
     "load_detector": "detectors.named",
     "load_localizer": "localizers.named",
     "open_dataset": "datasets.opening",
@@ -101,6 +108,8 @@ _LAZY = {
     "remember_sequence": "fusion.memory",
     "run": "api",
     "self_calibrate": "fusion.self_calibration",
+    "simulate_drive": "simulation.frames",
+    "simulate_frame": "simulation.frames",
     "to_classes": "detectors.classes",
     "write_detections_2d": "formats.plain",
     "write_detections_3d": "formats.plain",
@@ -122,6 +131,7 @@ __all__ = [
     "Camera",
     "CameraBoxes",
     "CameraModel",
+    "ClocsFusion",
     "Dataset",
     "Detections2D",
     "Detections3D",
@@ -150,9 +160,11 @@ __all__ = [
     "SyncSettings",
     "WatchSettings",
     "adapt_points",
+    "demo_frames",
     "draw",
     "evaluate",
     "evaluate_generalization",
+    "export_onnx",
     "load_detector",
     "load_localizer",
     "open_dataset",
@@ -165,6 +177,8 @@ __all__ = [
     "remember_sequence",
     "run",
     "self_calibrate",
+    "simulate_drive",
+    "simulate_frame",
     "to_classes",
     "write_bag",
     "write_detections_2d",

@@ -26,6 +26,7 @@ def run(
     *,
     config: str | Path | FusionConfig | None = None,
     jobs: int = 1,
+    ray: str | None = None,
     resume: bool = False,
     overwrite: bool = False,
     **options: Any,
@@ -39,6 +40,7 @@ def run(
         out: the run folder, see `lcf3d.run.folder`.
         config: preset, YAML file or settings; the dataset's preset without it.
         jobs: processes.
+        ray: address of a Ray cluster to run on, ``auto`` for that of this machine.
         resume: continue a run that was interrupted.
         overwrite: replace the run that ``out`` holds.
         options: further fields of `lcf3d.run.setup.RunRequest`, for example ``split="val"`` or ``recovery="off"``.
@@ -50,10 +52,13 @@ def run(
         Lcf3dError: anything wrong with the request, the dataset or the result files.
     """
     from lcf3d.fusion.config import FusionConfig
-    from lcf3d.run.frames import run_frames, total
+    from lcf3d.remote.places import local
+    from lcf3d.remote.urls import is_url
+    from lcf3d.run.frames import total
+    from lcf3d.run.ray_workers import fuse_frames
     from lcf3d.run.setup import RunRequest, prepare_run
 
-    folder = Path(out).expanduser()
+    folder = local(out, new=True)
     settings = config if isinstance(config, FusionConfig) else None
     named = None if config is None or settings is not None else str(config)
     cameras = {"*": camera} if isinstance(camera, str) else dict(camera)
@@ -63,9 +68,13 @@ def run(
         raise ConfigError(f"run() does not know that option: {error}") from None
     prepared = prepare_run(request, folder, resume=resume, overwrite=overwrite, settings=settings)
     pending = [frame_id for frame_id in prepared.frame_ids if not prepared.folder.is_done(frame_id)]
-    counts = total(list(run_frames(prepared.runner, pending, jobs)))
+    counts = total(list(fuse_frames(prepared, pending, jobs, ray)))
     prepared.folder.finish(prepared.frame_ids)
-    return {**counts, "already_done": len(prepared.frame_ids) - len(pending), "out": str(folder)}
+    return {
+        **counts,
+        "already_done": len(prepared.frame_ids) - len(pending),
+        "out": str(out if is_url(out) else folder),
+    }
 
 
 def evaluate(
@@ -96,10 +105,11 @@ def evaluate(
     from lcf3d.datasets.base import require_missing
     from lcf3d.datasets.opening import open_dataset
     from lcf3d.evaluation.protocol import EvaluationOptions, open_evaluation
+    from lcf3d.remote.places import local
     from lcf3d.run.conversion import as_files
 
     data = open_dataset(dataset, split=split) if isinstance(dataset, str | Path) else dataset
-    path = Path(results).expanduser()
+    path = local(results)
     evaluation = open_evaluation(data, frames, EvaluationOptions(**options))
     return evaluation.read(as_files(path, data), path.name, require_missing(missing))
 
@@ -138,9 +148,10 @@ def read_run(folder: str | Path) -> dict[str, FusedDetections]:
         FormatError: a file is missing or not readable.
         ConfigError: it is no run folder, or one of a later version.
     """
+    from lcf3d.remote.places import local
     from lcf3d.run.table_folder import open_run_folder
 
-    run_folder = open_run_folder(Path(folder).expanduser())
+    run_folder = open_run_folder(local(folder))
     if not run_folder.is_run(run_folder.path):
         raise ConfigError(f"{folder} is no folder of 'lcf3d run': it has no run.json and provenance")
     run_folder.request()

@@ -10,6 +10,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import shutil
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -17,6 +18,8 @@ from pathlib import Path
 from typing import Any
 
 from lcf3d.errors import ConfigError, DatasetError, FormatError, Lcf3dError
+from lcf3d.remote.places import publish
+from lcf3d.remote.urls import is_url, url_of
 
 GIGABYTE = 1 << 30
 MOST_GIGABYTES = 8.0
@@ -27,20 +30,32 @@ _SHOWN = 120
 
 
 @contextmanager
-def atomic_path(path: Path) -> Iterator[Path]:
+def atomic_path(path: str | Path) -> Iterator[Path]:
     """A temporary path beside ``path`` to write to; it takes the place of ``path`` when the block ends well.
+
+    Where ``path`` stands for a file elsewhere (`lcf3d.remote`), the finished file is sent there first.
 
     Its name begins with a dot and holds the process's number: no listing takes it for a finished file, and
     `remove_left_overs` finds it after a crash.
 
     Raises:
         OSError: no place left, no permission ...; names ``path``.
+        DatasetError: it cannot be written where it lies.
+        ConfigError: a URL that no folder here stands for.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f"{_TEMPORARY}.{os.getpid()}.{path.name}")
+    path = Path(path)
+    if is_url(path):
+        raise ConfigError(f"{url_of(path)} lies elsewhere, and this is written on this machine only; name a path of it")
+    folder = path.parent
+    if not os.path.isdir(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+    temporary = folder / f"{_TEMPORARY}.{os.getpid()}.{path.name}"
+    moved = False
     try:
         yield temporary
+        publish(temporary, path)
         os.replace(temporary, path)
+        moved = True
     except OSError as error:
         # the file that was to be written, not the one that nobody knows
         if error.errno == errno.ENOSPC:
@@ -49,7 +64,8 @@ def atomic_path(path: Path) -> Iterator[Path]:
             raise OSError(error.errno, error.strerror, str(path)) from None
         raise
     finally:
-        temporary.unlink(missing_ok=True)
+        if not moved:
+            temporary.unlink(missing_ok=True)
 
 
 def is_hidden(path: Path) -> bool:
@@ -151,7 +167,7 @@ def largest_size() -> int:
         raise ConfigError(f"LCF3D_MAX_FILE_GB must be a number of gigabytes, got {shortened(text)!r}") from None
 
 
-def require_file(path: Path) -> None:
+def require_file(path: str | Path) -> None:
     """See that a path is a regular file of a size that real data has, without opening it.
 
     Raises:
@@ -175,7 +191,7 @@ def require_file(path: Path) -> None:
         )
 
 
-def read_bytes(path: Path) -> bytes:
+def read_bytes(path: str | Path) -> bytes:
     """The content of a file.
 
     Raises:
@@ -187,7 +203,7 @@ def read_bytes(path: Path) -> bytes:
         return file.read()
 
 
-def read_text(path: Path) -> str:
+def read_text(path: str | Path) -> str:
     """The text of a file in UTF-8, without a byte order mark.
 
     Raises:
@@ -200,18 +216,24 @@ def read_text(path: Path) -> str:
         raise FormatError(f"{path} is not a text file in UTF-8") from None
 
 
-def write_text(path: Path, text: str) -> None:
+def write_text(path: str | Path, text: str) -> None:
     """Write ``text`` to ``path``, whole or not at all."""
+    with atomic_path(path) as temporary, open(temporary, "wb") as file:
+        file.write(text.encode())
+
+
+def copy_file(source: Path, path: Path) -> None:
+    """Copy a file to ``path``, whole or not at all."""
     with atomic_path(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+        shutil.copyfile(source, temporary)
 
 
-def write_json(path: Path, value: Any, indent: int | None = 2) -> None:
+def write_json(path: str | Path, value: Any, indent: int | None = 2) -> None:
     """Write ``value`` as JSON to ``path``, whole or not at all."""
     write_text(path, json.dumps(value, indent=indent) + "\n")
 
 
-def read_json(path: Path) -> Any:
+def read_json(path: str | Path) -> Any:
     """The value in a JSON file.
 
     Raises:

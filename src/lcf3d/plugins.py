@@ -27,6 +27,8 @@ from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
 from lcf3d.errors import ConfigError, DetectorError, Lcf3dError
+from lcf3d.remote.places import local
+from lcf3d.remote.urls import is_url
 
 Setting = int | float | bool | str
 
@@ -173,7 +175,12 @@ def _arguments(group: str, spec: Spec, call: Any) -> tuple[str, ...]:
         raise ConfigError(f"{GROUPS[group]} {spec.kind!r} needs an argument: {spec.kind}:{parameters[0].name.upper()}")
     if not wanted and spec.argument:
         raise ConfigError(f"{GROUPS[group]} {spec.kind!r} takes no argument, got {spec.argument!r}")
-    return (spec.argument,) if wanted else ()
+    if not wanted:
+        return ()
+    # an address or archive is read like a folder where the kind cannot mean anything else by it
+    own = (group == "lcf3d.datasets" or spec.kind == "results") and not _origin(_points(group)[spec.kind])
+    elsewhere = is_url(spec.argument) and not spec.argument.startswith("http")
+    return (str(local(spec.argument)) if own or elsewhere else spec.argument,)
 
 
 @cache

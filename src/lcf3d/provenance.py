@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, fields, replace
 from enum import IntEnum
+from math import isnan
 from typing import Any
 
 import numpy as np
@@ -52,6 +54,10 @@ class Reason(IntEnum):
     POOR_FIT = 23
 
 
+OUTCOMES = tuple(outcome.name.lower() for outcome in Outcome)
+REASONS = tuple(reason.name.lower() for reason in Reason)
+"""Words of the codes, by code."""
+
 REASON_TEXT = {
     Reason.CONFIRMED: "a camera detection confirms the cluster",
     Reason.IN_CLUSTER: "a box of higher score represents its cluster",
@@ -78,6 +84,12 @@ REASON_TEXT = {
     Reason.SECOND_VIEW: "it confirms the cluster beside the more confident view of its stereo pair",
     Reason.UNPAIRED: "no LiDAR box matches it, and no detection of its stereo pair's other view shows the same object",
 }
+
+
+WHOLE = ("cluster", "lidar", "camera", "detection", "output", "pair")
+"""Columns of `Decisions` that hold numbers of something, -1 for none."""
+REAL = ("iou", "lidar_score", "camera_score", "score", "quality")
+"""Columns of `Decisions` that hold measures, NaN for none."""
 
 
 @dataclass(eq=False)
@@ -119,48 +131,50 @@ class Decisions:
     @classmethod
     def blank(cls, n: int) -> Decisions:
         """``n`` rows of dropped inputs, all else unset; the fusion fills its columns."""
-        none, nan = np.full(n, -1, dtype=np.int64), np.full(n, np.nan)
-        return cls(
-            outcome=np.full(n, Outcome.DROPPED, dtype=np.int64),
-            reason=np.full(n, Reason.LOW_SCORE, dtype=np.int64),
-            cluster=none.copy(),
-            lidar=none.copy(),
-            camera=none.copy(),
-            detection=none.copy(),
-            iou=nan.copy(),
-            lidar_score=nan.copy(),
-            camera_score=nan.copy(),
-            score=nan.copy(),
-            output=none.copy(),
-            pair=none.copy(),
-            quality=nan.copy(),
-        )
+        # one block a type: a table is made for every frame
+        whole, real = np.full((len(WHOLE) + 2, n), -1, dtype=np.int64), np.full((len(REAL), n), np.nan)
+        whole[0], whole[1] = Outcome.DROPPED, Reason.LOW_SCORE
+        columns: dict[str, Any] = dict(zip(("outcome", "reason", *WHOLE, *REAL), (*whole, *real), strict=True))
+        return cls(**columns)
 
     def __len__(self) -> int:
         return len(self.outcome)
 
     def freeze(self) -> None:
         """Make all columns read-only: what was decided stays."""
-        for column in fields(self):
-            getattr(self, column.name).flags.writeable = False
+        for column in self.__dict__.values():
+            column.setflags(write=False)
+
+    def as_lists(self) -> Decisions:
+        """The same with lists for columns: single cells are read much quicker than those of arrays."""
+        columns: dict[str, Any] = {name: column.tolist() for name, column in self.__dict__.items()}
+        return Decisions(**columns)
+
+    def columns(self) -> dict[str, list[Any]]:
+        """Each column in words and numbers, None where unset."""
+        result: dict[str, list[Any]] = {
+            "outcome": [OUTCOMES[code] for code in self.outcome.tolist()],
+            "reason": [REASONS[code] for code in self.reason.tolist()],
+        }
+        for name in WHOLE:
+            result[name] = [None if value < 0 else value for value in getattr(self, name).tolist()]
+        for name in REAL:
+            # only NaN is not what it is
+            result[name] = [None if value != value else value for value in getattr(self, name).tolist()]
+        return result
 
     def row(self, index: int) -> dict[str, Any]:
-        """One row in words and numbers, None where unset."""
-        result: dict[str, Any] = {
-            "outcome": Outcome(self.outcome[index]).name.lower(),
-            "reason": Reason(self.reason[index]).name.lower(),
-        }
-        for name in ("cluster", "lidar", "camera", "detection", "output", "pair"):
-            value = int(getattr(self, name)[index])
-            result[name] = value if value >= 0 else None
-        for name in ("iou", "lidar_score", "camera_score", "score", "quality"):
-            number = float(getattr(self, name)[index])
-            result[name] = None if np.isnan(number) else number
-        return result
+        """One row of `columns`."""
+        return {name: column[index] for name, column in self.columns().items()}
+
+    def rows(self) -> list[dict[str, Any]]:
+        """All rows of `columns`."""
+        columns = self.columns()
+        return [dict(zip(columns, cells, strict=True)) for cells in zip(*columns.values(), strict=True)]
 
     @classmethod
     def from_rows(cls, rows: Sequence[dict[str, Any]]) -> Decisions:
-        """The inverse of `row` over all rows."""
+        """The inverse of `rows`."""
         decisions = cls.blank(len(rows))
         for i, row in enumerate(rows):
             # lcf3d 0.1 wrote "stage", and another word for a class that the camera does not detect
@@ -262,7 +276,9 @@ class FusedDetections:
         place = np.empty(len(order) + 1, dtype=np.int64)
         place[order] = np.arange(len(order))
         place[-1] = -1  # no output before, none now
-        tables = [replace(table, output=place[table.output]) for table in (self.lidar, self.camera)]
+        tables = [copy(self.lidar), copy(self.camera)]
+        for table in tables:
+            table.output = place[table.output]
         return replace(self, detections=detections, lidar=tables[0], camera=tables[1], tracks=tracks)
 
     @property
@@ -277,21 +293,45 @@ class FusedDetections:
         return outcomes
 
     @property
+    def origins(self) -> list[str]:
+        """What became of every output, in words: an `Outcome`, or ``downweighted`` where no camera confirms it."""
+        names = [Outcome(outcome).name.lower() for outcome in self.outcomes]
+        lowered = self.lidar.output[self.lidar.reason == Reason.DOWNWEIGHTED]
+        for output in lowered[lowered >= 0]:
+            names[output] = "downweighted"
+        return names
+
+    @property
     def dropped_lidar(self) -> IntArray:
         """Indices of the LiDAR detections that were dropped, without those that another box of theirs represents."""
-        merged = np.isin(self.lidar.reason, [Reason.IN_CLUSTER, Reason.SUPPRESSED])
+        merged = (self.lidar.reason == Reason.IN_CLUSTER) | (self.lidar.reason == Reason.SUPPRESSED)
         return np.flatnonzero((self.lidar.outcome == Outcome.DROPPED) & ~merged)
 
     def explain(self, output: int) -> str:
         """One sentence on why output ``output`` is there, with the numbers that decided."""
+        predicted = self.tracks is not None and self.tracks.predicted[output]
+        return self._sentence(output, "" if predicted else self._because(*self._origin(output), self.camera))
+
+    def explanations(self) -> list[str]:
+        """`explain` of every output; quicker than one after the other."""
+        origins: dict[int, str] = {}
+        lidar, camera = self.lidar.as_lists(), self.camera.as_lists()
+        for table in (lidar, camera):
+            for row, output in enumerate(table.output):
+                if output >= 0 and output not in origins:
+                    origins[output] = self._because(table, row, camera)
+        return [self._sentence(output, origins.get(output, "")) for output in range(len(self))]
+
+    def _sentence(self, output: int, because: str) -> str:
+        """What an output is, why it is there (empty for one that only the memory predicts), and its past."""
         label = self.detections.class_names[self.detections.labels[output]]
         score = f"{label} {self.detections.scores[output]:.2f}"
         if self.tracks is None:
-            return f"{score}, {self._because(*self._origin(output))}"
+            return f"{score}, {because}"
         past = self._past_text(self.tracks, output)
         if self.tracks.predicted[output]:
             return f"{score}, predicted: no detection of this frame shows it, but {past}"
-        return f"{score}, {self._because(*self._origin(output))}; {past}"
+        return f"{score}, {because}; {past}"
 
     @staticmethod
     def _past_text(tracks: TrackTable, output: int) -> str:
@@ -308,28 +348,29 @@ class FusedDetections:
     def explain_lidar(self, index: int) -> str:
         """One sentence on what became of LiDAR detection ``index`` of those given."""
         label = self.lidar_inputs.class_names[self.lidar_inputs.labels[index]]
-        return f"{label} {self.lidar_inputs.scores[index]:.2f}, {self._because(self.lidar, index)}"
+        return f"{label} {self.lidar_inputs.scores[index]:.2f}, {self._because(self.lidar, index, self.camera)}"
 
     def explain_camera(self, row: int) -> str:
         """One sentence on what became of the 2D detection in row ``row`` of ``camera``."""
         found = self.camera_inputs[self.camera.camera[row]]
         index = self.camera.detection[row]
-        return f"{found.class_names[found.labels[index]]} {found.scores[index]:.2f}, {self._because(self.camera, row)}"
+        because = self._because(self.camera, row, self.camera)
+        return f"{found.class_names[found.labels[index]]} {found.scores[index]:.2f}, {because}"
 
-    def _because(self, table: Decisions, row: int) -> str:
-        """Outcome, reason, and where a row comes from, in words."""
+    def _because(self, table: Decisions, row: int, camera: Decisions) -> str:
+        """Outcome, reason, and where a row comes from, in words; ``camera`` is the table of 2D detections."""
         parts = []
         if table.lidar[row] >= 0:
             parts.append(f"LiDAR detection {table.lidar[row]} (score {table.lidar_score[row]:.2f})")
         if table.camera[row] >= 0:
             parts.append(self._camera_text(table, row))
         if table.pair[row] >= 0:
-            parts.append(self._camera_text(self.camera, int(table.pair[row])))
-        overlap = "" if np.isnan(table.iou[row]) else f", image IoU {table.iou[row]:.2f}"
-        if not np.isnan(table.quality[row]):
+            parts.append(self._camera_text(camera, int(table.pair[row])))
+        overlap = "" if isnan(table.iou[row]) else f", image IoU {table.iou[row]:.2f}"
+        if not isnan(table.quality[row]):
             overlap += f", fit {table.quality[row]:.2f}"
-        outcome = Outcome(table.outcome[row]).name.lower()
-        return f"{outcome}: {REASON_TEXT[Reason(table.reason[row])]}; from {' and '.join(parts)}{overlap}"
+        reason = REASON_TEXT[Reason(table.reason[row])]
+        return f"{OUTCOMES[table.outcome[row]]}: {reason}; from {' and '.join(parts)}{overlap}"
 
     def _camera_text(self, table: Decisions, row: int) -> str:
         """The 2D detection of a row in words."""
@@ -354,8 +395,8 @@ class FusedDetections:
             "detections": _detections_to_json(self.detections),
             "lidar_inputs": _detections_to_json(self.lidar_inputs),
             "camera_inputs": [_detections_to_json(d) for d in self.camera_inputs],
-            "lidar": [self.lidar.row(i) for i in range(len(self.lidar))],
-            "camera": [self.camera.row(i) for i in range(len(self.camera))],
+            "lidar": self.lidar.rows(),
+            "camera": self.camera.rows(),
         }
 
     @classmethod

@@ -13,9 +13,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from copy import copy
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -27,6 +27,7 @@ from lcf3d.errors import ConfigError, ShapeError
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
+Detections = TypeVar("Detections", "Detections2D", "Detections3D")
 
 KITTI_CLASSES = ("Car", "Pedestrian", "Cyclist")
 NUSCENES_CLASSES = (
@@ -57,7 +58,11 @@ def _array(value: ArrayLike, dtype: Any, shape: tuple[int | None, ...], what: st
     if hasattr(value, "detach"):
         # a tensor of torch, which may be on a GPU and want a gradient
         value = value.detach().cpu().numpy()
-    array = np.array(value, dtype=dtype)
+    if type(value) is np.ndarray and value.flags.owndata and not value.flags.writeable and value.dtype == dtype:
+        # nobody can change it
+        array: NDArray[Any] = value
+    else:
+        array = np.array(value, dtype=dtype)
     if array.size == 0 and array.ndim <= len(shape):
         array = array.reshape([0 if n is None else n for n in shape])
     wrong = array.ndim != len(shape) or any(n is not None and n != m for n, m in zip(shape, array.shape, strict=False))
@@ -187,6 +192,20 @@ class Detections3D(Converters3D):
                 object.__setattr__(self, name, _array(value, dtype, shape, f"Detections3D.{name}"))
 
     @classmethod
+    def trusted(
+        cls,
+        boxes: FloatArray,
+        scores: FloatArray,
+        labels: IntArray,
+        class_names: tuple[str, ...],
+        velocities: FloatArray | None = None,
+        attributes: NDArray[np.str_] | None = None,
+    ) -> Detections3D:
+        """As the constructor, for new arrays known to be right: nothing is copied or checked, they become read-only."""
+        columns = {"boxes": boxes, "scores": scores, "labels": labels, "class_names": class_names}
+        return _trusted(cls, **columns, velocities=velocities, attributes=attributes)
+
+    @classmethod
     def empty(cls, class_names: Sequence[str]) -> Detections3D:
         """No detections, for the given classes."""
         return cls(np.zeros((0, 7)), np.zeros(0), np.zeros(0, np.int64), tuple(class_names))
@@ -202,7 +221,7 @@ class Detections3D(Converters3D):
             )
         if any(p.attributes is not None for p in parts):
             attributes = np.concatenate([np.full(len(p), "") if p.attributes is None else p.attributes for p in parts])
-        return cls(
+        return cls.trusted(
             np.concatenate([p.boxes for p in parts]),
             np.concatenate([p.scores for p in parts]),
             np.concatenate([p.labels for p in parts]),
@@ -216,8 +235,11 @@ class Detections3D(Converters3D):
 
     def __getitem__(self, index: Any) -> Detections3D:
         """Those selected by a slice, an integer array or a boolean mask."""
-        return Detections3D(
-            self.boxes[index],
+        boxes = self.boxes[index]
+        # the constructor says what is wrong with another kind of index
+        create = Detections3D.trusted if boxes.ndim == 2 else Detections3D
+        return create(
+            boxes,
             self.scores[index],
             self.labels[index],
             self.class_names,
@@ -230,9 +252,10 @@ class Detections3D(Converters3D):
 
         ``mapping`` goes from own name to new name; names missing from it (or all, without it) keep their name.
         """
+        if mapping is None and tuple(class_names) == self.class_names:
+            return self
         kept, labels = _relabel(self.labels, self.class_names, class_names, mapping)
-        selected = self[kept]
-        return replace(selected, labels=labels, class_names=tuple(class_names))
+        return with_columns(self[kept], labels=labels, class_names=tuple(class_names))
 
 
 @dataclass(frozen=True, eq=False)
@@ -261,6 +284,18 @@ class Detections2D(Converters2D):
                 raise ShapeError(f"Detections2D has {len(self.boxes)} boxes but {len(self.masks)} masks")
 
     @classmethod
+    def trusted(
+        cls,
+        boxes: FloatArray,
+        scores: FloatArray,
+        labels: IntArray,
+        class_names: tuple[str, ...],
+        masks: tuple[InstanceMask | None, ...] | None = None,
+    ) -> Detections2D:
+        """As the constructor, for new arrays known to be right: nothing is copied or checked, they become read-only."""
+        return _trusted(cls, boxes=boxes, scores=scores, labels=labels, class_names=class_names, masks=masks)
+
+    @classmethod
     def empty(cls, class_names: Sequence[str]) -> Detections2D:
         """No detections, for the given classes."""
         return cls(np.zeros((0, 4)), np.zeros(0), np.zeros(0, np.int64), tuple(class_names))
@@ -272,7 +307,7 @@ class Detections2D(Converters2D):
         masks: tuple[InstanceMask | None, ...] | None = None
         if any(p.masks is not None for p in parts):
             masks = tuple(m for p in parts for m in (p.masks if p.masks is not None else (None,) * len(p)))
-        return cls(
+        return cls.trusted(
             np.concatenate([p.boxes for p in parts]),
             np.concatenate([p.scores for p in parts]),
             np.concatenate([p.labels for p in parts]),
@@ -288,21 +323,24 @@ class Detections2D(Converters2D):
         masks = self.masks
         if masks is not None:
             masks = tuple(masks[i] for i in np.arange(len(masks))[index])
-        return Detections2D(self.boxes[index], self.scores[index], self.labels[index], self.class_names, masks)
+        boxes = self.boxes[index]
+        create = Detections2D.trusted if boxes.ndim == 2 else Detections2D
+        return create(boxes, self.scores[index], self.labels[index], self.class_names, masks)
 
     def clipped(self, camera: Camera) -> Detections2D:
         """The same with boxes cut to the camera's image."""
         limits = np.array([camera.width, camera.height, camera.width, camera.height], dtype=np.float64)
-        return replace(self, boxes=np.clip(self.boxes, 0, limits))
+        return with_columns(self, boxes=np.minimum(np.maximum(self.boxes, 0), limits))
 
     def with_classes(self, class_names: Sequence[str], mapping: Mapping[str, str] | None = None) -> Detections2D:
         """The same detections with labels of ``class_names``; those of classes that map to none are dropped.
 
         ``mapping`` goes from own name to new name; names missing from it (or all, without it) keep their name.
         """
+        if mapping is None and tuple(class_names) == self.class_names:
+            return self
         kept, labels = _relabel(self.labels, self.class_names, class_names, mapping)
-        selected = self[kept]
-        return replace(selected, labels=labels, class_names=tuple(class_names))
+        return with_columns(self[kept], labels=labels, class_names=tuple(class_names))
 
 
 @dataclass(frozen=True, eq=False)
@@ -408,6 +446,21 @@ class Frame:
 
     def __repr__(self) -> str:
         return f"Frame({self.id!r}, cameras={[c.name for c in self.cameras]})"
+
+
+def _trusted(kind: type[Detections], **columns: Any) -> Detections:
+    """Detections of arrays that are known to be right, see `Detections3D.trusted`."""
+    made = object.__new__(kind)
+    made.__dict__.update(columns)
+    for column in made.__dict__.values():
+        if isinstance(column, np.ndarray):
+            column.setflags(write=False)
+    return made
+
+
+def with_columns(detections: Detections, **columns: Any) -> Detections:
+    """The same detections with other columns, as many and of the same types; they become read-only, not copied."""
+    return _trusted(type(detections), **{**detections.__dict__, **columns})
 
 
 def _validate(detections: Detections2D | Detections3D, box_shape: tuple[int | None, int]) -> None:

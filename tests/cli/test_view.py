@@ -149,3 +149,13 @@ def test_a_run_whose_dataset_has_moved(run_folder: Path, kitti: Path) -> None:
         path.unlink()
     with pytest.raises(ConfigError, match="holds no finished frames yet"):
         view(f"kitti:{kitti.with_name('moved')}", "--results", run_folder)
+
+
+def test_a_picture_that_moves(run_folder: Path, tmp_path: Path) -> None:
+    assert "2 frames in" in view(run_folder, "--gif", tmp_path / "run.gif")
+    with PIL.Image.open(tmp_path / "run.gif") as picture:
+        assert picture.n_frames == 2
+    assert not (run_folder / "pictures").exists()
+    for wrong in (("--gif", tmp_path / "run.png"), ("--gif", tmp_path / "a.gif", "--out", tmp_path / "b.png")):
+        with pytest.raises(ConfigError, match=r"ends in \.gif and goes without --out"):
+            view(run_folder, *wrong)

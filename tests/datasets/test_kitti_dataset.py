@@ -6,7 +6,8 @@ from lcf3d.datasets.kitti import KittiDataset, read_points
 from lcf3d.datasets.kitti_calibration import read_calibration
 from lcf3d.datasets.opening import named, open_dataset
 from lcf3d.errors import Lcf3dError
-from tests.datasets.kitti_folder import CAMERA_FROM_LIDAR, LABELS, OBJECTS, P2, SIZE, make_kitti
+from lcf3d.formats.kitti import KittiObjects, write_objects
+from tests.datasets.kitti_folder import CAMERA_FROM_LIDAR, LABELS, OBJECTS, P2, SIZE, make_kitti, make_results
 
 
 @pytest.fixture
@@ -29,6 +30,33 @@ def test_frame_holds_what_was_written(root):
     assert "right" not in frame.images
     np.testing.assert_allclose(frame.labels.boxes, OBJECTS, atol=2e-4)
     assert frame.labels.labels.tolist() == LABELS
+
+
+def test_calibrations_of_one_text_are_one_until_a_file_changes(root):
+    dataset = KittiDataset(root)
+    first, second = dataset.frame("000000"), dataset.frame("night_7")
+    assert first.cameras[0] is not None
+    assert dataset.calibration("000000") is dataset.calibration("night_7")
+    assert not dataset.calibration("000000").camera_from_lidar.flags.writeable
+    # the right cameras are without an image in both
+    assert first.camera("right") is second.camera("right")
+    path = root / "training/calib/night_7.txt"
+    path.write_text(path.read_text().replace("P2: ", "P2: 1"))
+    assert dataset.frame("night_7").cameras[0].projection[0, 0] != P2[0][0]
+    assert dataset.frame("000000").cameras[0].projection[0, 0] == P2[0][0]
+
+
+def test_range_of_scores_without_a_look_at_frames(root):
+    lidar, camera = make_results(root)
+    write_objects(lidar / "000001.txt", KittiObjects.empty(results=True))
+    dataset = KittiDataset(root)
+    source = dataset.lidar_results(lidar, ("Car",))
+    assert source.score_range(["000001"]) == (0, 0)
+    assert source.score_range(dataset.ids) == (0, 0.9)
+    assert source.detect(dataset.frame("000000")).scores.tolist() == [0.9, 0.8]
+    assert dataset.lidar_results(lidar, ("Pedestrian",), "empty").class_names == ("Pedestrian",)
+    with pytest.raises(Lcf3dError, match="holds no 3D boxes"):
+        dataset.lidar_results(camera, ("Car",)).score_range(dataset.ids)
 
 
 def test_all_frames_without_a_split(root):

@@ -6,6 +6,7 @@ from lcf3d.evaluation.curves import (
     ScoreEvents,
     average_precision,
     best_f1_score,
+    exact_average_precision,
     precision_curve,
     precision_recall,
     resampled_curves,
@@ -53,6 +54,27 @@ def test_equal_scores_come_in_together() -> None:
     assert recall.tolist() == [1]
     assert precision.tolist() == [0.5]
     assert scores.tolist() == [0.5]
+
+
+def test_exact_average_precision_by_hand() -> None:
+    # a quarter of the recall at precision 1, the next at 2 / 3, the rest is never reached
+    assert exact_average_precision(MIXED) == pytest.approx(100 * (1 / 4 + 1 / 4 * 2 / 3))
+
+
+def test_few_objects_have_an_exact_average_precision_of_100_and_an_official_one_far_below() -> None:
+    perfect = events([(1 - i / 10, 0, 1, 0) for i in range(10)], [10])
+    assert exact_average_precision(perfect) == pytest.approx(100)
+    assert precision_curve(perfect)[0].average_precision() == pytest.approx(22.5)
+
+
+def test_many_objects_have_the_same_average_precision_either_way() -> None:
+    right = np.random.default_rng(0).random(4000) < np.linspace(1, 0.2, 4000)
+    many = events([(1 - i / 4000, 0, int(hit), int(not hit)) for i, hit in enumerate(right)], [3000])
+    assert exact_average_precision(many) == pytest.approx(precision_curve(many)[0].average_precision(), abs=1.5)
+
+
+def test_without_objects_there_is_no_exact_average_precision() -> None:
+    assert np.isnan(exact_average_precision(events([(0.5, 0, 0, 1)], [0])))
 
 
 def test_best_f1() -> None:

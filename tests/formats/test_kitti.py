@@ -235,6 +235,39 @@ def test_2d_detections_are_written_without_a_3d_box() -> None:
     assert text == "Car -1 -1 -10 1 2 3 4 -1 -1 -1 -1000 -1000 -1000 -10 0.5\n"
 
 
+NUMBERS = st.floats(-1e5, 1e5) | st.sampled_from([0.0, -0.0, -0.00004, 100.0, 0.05, 10.5, -1000.0])
+
+
+@given(st.lists(st.tuples(st.lists(NUMBERS, min_size=13, max_size=13), NUMBERS), max_size=4), st.booleans())
+def test_numbers_of_a_file_are_written_like_single_ones(rows: list[tuple[list[float], float]], scored: bool) -> None:
+    values = np.array([row for row, _ in rows]).reshape(-1, 13)
+    scores = np.array([score for _, score in rows])
+    n = len(rows)
+    objects = kitti.KittiObjects(
+        # a name may end like a number with zeros
+        np.array(["Car.00"] * n, dtype=np.str_),
+        values[:, 0],
+        np.full(n, 10),
+        values[:, 1],
+        values[:, 2:6],
+        values[:, 6:9],
+        values[:, 9:12],
+        values[:, 12],
+        scores if scored else None,
+    )
+
+    def written(value: float) -> str:
+        text = f"{value:.4f}".rstrip("0").rstrip(".")
+        return "0" if text == "-0" else text
+
+    expected = ""
+    for i, (row, score) in enumerate(rows):
+        box = row[6:] if objects.has_box3d[i] else [-1, -1, -1, -1000, -1000, -1000, -10]
+        fields = [written(value) for value in (row[0], 10, *row[1:6], *box)]
+        expected += " ".join(["Car.00", *fields, *([f"{score:.8g}"] if scored else [])]) + "\n"
+    assert kitti.format_objects(objects) == expected
+
+
 @pytest.mark.real
 def test_every_shared_kitti_file_is_read(shared: Path) -> None:
     root = shared / "data" / "kitti"

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -17,7 +19,7 @@ from lcf3d.fusion.alignment import (
     vector_of,
 )
 from lcf3d.fusion.alignment_matching import Sighting, vote_rotation
-from lcf3d.fusion.alignment_watch import AlignmentWatch, WatchSettings, estimate
+from lcf3d.fusion.alignment_watch import AlignmentWatch, WatchSettings, estimate, judge
 from lcf3d.geometry.camera import project_boxes, project_points
 from lcf3d.structures import Camera, Detections2D, Frame
 from tests.fusion.scenes import CAR, PEDESTRIAN, camera, car, lidar, pedestrian
@@ -152,6 +154,41 @@ def test_a_time_offset_is_told_from_a_rotation_by_objects_that_move_differently(
     assert np.rad2deg(found.rotation[1]) == pytest.approx(0.5, abs=0.05)
     without = estimate(sightings, Alignment.nominal())
     assert abs(without.state[TIME]) < 1e-6
+
+
+def test_noise_in_velocities_and_boxes_does_not_make_a_time_offset_smaller():
+    rng, view, late = np.random.default_rng(3), camera(), 0.2
+    boxes = np.array([car(x, rng.uniform(-0.4, 0.4) * x) for x in rng.uniform(10, 45, 1500)])
+    true = np.column_stack([np.zeros(len(boxes)), rng.choice([-2.0, 2.0], len(boxes)), np.zeros(len(boxes))])
+    then = boxes.copy()
+    then[:, :3] += late * true
+    edges, _ = project_boxes(then, view)
+    believed = true + rng.normal(0, 0.5, true.shape) * [1, 1, 0]
+    seen = boxes + np.column_stack([rng.normal(0, 0.1, (len(boxes), 3)), np.zeros((len(boxes), 4))])
+    sure = fit_alignment(BoxPairs.of(seen, edges, view, believed), Alignment.nominal(), time=True)
+    # least squares that takes the velocities as exact: smaller by 0.25 / (4 + 0.25)
+    assert sure.time_offset < 0.193
+    known = BoxPairs.of(seen, edges, view, believed, unsure=np.full(len(boxes), 0.5))
+    assert fit_alignment(known, Alignment.nominal(), time=True).time_offset == pytest.approx(late, abs=0.004)
+
+
+def test_what_stands_is_sure_to_and_what_moves_is_not():
+    view = camera()
+    boxes = np.array([car(12.0), car(25.0, 4.0)])
+    found = Detections2D(project_boxes(boxes, view)[0], np.full(2, 0.9), np.zeros(2, int), NAMES)
+    detections = replace(lidar(boxes, [0.9, 0.8]), velocities=np.array([[1.0, 0.5], [3.0, 0.0]]))
+    sighting = Sighting.of(view, detections, found, np.zeros((2, 3)))
+    assert sighting.unsure.tolist() == [0.0, 0.5]
+
+
+def test_an_estimate_that_needs_impossible_boxes_raises_no_alarm():
+    state = np.zeros(9)
+    state[1] = np.deg2rad(5.0)
+    sure = Alignment(state, np.diag(np.full(9, 1e-8)), 40)
+    assert judge(sure, WatchSettings()) == "wrong"
+    state = state.copy()
+    state[6] = 0.25
+    assert judge(replace(sure, state=state), WatchSettings()) == "unknown"
 
 
 def test_displacement_is_held_near_zero_unless_many_pairs_ask_for_it():

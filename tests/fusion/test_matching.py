@@ -2,6 +2,9 @@ import itertools
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.optimize import linear_sum_assignment
 
 from lcf3d.fusion.clustering import Clusters, cluster_boxes
 from lcf3d.fusion.matching import assign, cluster_iou, confirmed_elsewhere, match_view, merge_views
@@ -29,6 +32,19 @@ def test_assignment_is_the_best_of_all(seed):
     match = assign(iou, 0.3, "gated")
     assert sum(iou[i, m] for i, m in enumerate(match) if m >= 0) == pytest.approx(best)
     assert len(set(match[match >= 0])) == (match >= 0).sum()
+
+
+@given(st.integers(0, 10_000))
+def test_assignment_of_few_good_pairs_is_that_of_the_full_solver(seed):
+    # most of these matrices have a row or column with one good pair only, which no solver is asked about
+    rng = np.random.default_rng(seed)
+    iou = rng.uniform(0, 1, rng.integers(1, 6, 2)) * (rng.uniform(0, 1, 1) < 0.6)
+    iou[rng.uniform(0, 1, iou.shape) < 0.7] = 0
+    rows, columns = linear_sum_assignment(np.where(iou > 0.3, iou, 0), maximize=True)
+    expected = np.full(len(iou), -1)
+    good = iou[rows, columns] > 0.3
+    expected[rows[good]] = columns[good]
+    assert assign(iou, 0.3, "gated").tolist() == expected.tolist()
 
 
 def test_a_hopeless_pair_displaces_a_good_one_in_paper_mode_only():

@@ -310,8 +310,7 @@ def test_every_input_and_output_is_accounted_for(seed, unmatched, assignment):
     np.testing.assert_array_equal(fused.detections.scores[outputs], fused.lidar.score[matched])
     assert (np.diff(fused.detections.scores) <= 0).all()
     assert (fused.camera.reason == Reason.CONFIRMED).sum() == matched.sum()
-    for i in range(len(fused)):
-        assert fused.explain(i)
+    assert fused.explanations() == [fused.explain(i) for i in range(len(fused))]
 
 
 @given(st.integers(0, 300))

@@ -1,10 +1,11 @@
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from lcf3d.geometry.rotation import (
+    interpolated,
     invert_rigid,
     quaternions_from_matrices,
     quaternions_from_yaws,
@@ -71,3 +72,16 @@ def test_rigid_transform_and_its_inverse_cancel(q: np.ndarray, translation: tupl
     moved = transform_points(point, transform[0])
     np.testing.assert_allclose(moved, rotation_matrices(q)[0] @ point[0] + translation + np.zeros((1, 3)), atol=1e-9)
     np.testing.assert_allclose(transform_points(moved, invert_rigid(transform)), point, atol=1e-9)
+
+
+@settings(deadline=None)
+@given(st.lists(st.floats(-1.5, 1.5), min_size=6, max_size=6), st.floats(-0.5, 2))
+def test_between_two_poses_the_turn_goes_on_evenly(numbers, share):
+    start, turn = Rotation.from_rotvec(numbers[:3]), Rotation.from_rotvec(numbers[3:])
+    first, second = np.eye(4), np.eye(4)
+    first[:3, :3], second[:3, :3] = start.as_matrix(), (start * turn).as_matrix()
+    second[:3, 3] = [1.0, -2.0, 4.0]
+    pose = interpolated(first, second, share)
+    expected = start * Rotation.from_rotvec(share * np.array(numbers[3:]))
+    np.testing.assert_allclose(pose[:3, :3], expected.as_matrix(), atol=1e-7)
+    np.testing.assert_allclose(pose[:3, 3], share * second[:3, 3], atol=1e-12)

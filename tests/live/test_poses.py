@@ -51,3 +51,11 @@ def test_velocities_as_seen_from_the_moving_car():
     lidar = Detections3D(boxes, np.ones(3), np.zeros(3, int), ("Car",), [[15.0, 0], [0.5, 0], [np.nan, np.nan]])
     # one metre ahead in 0.1 s: what stands comes nearer with 10 m/s; half a metre a second counts as standing
     assert np.allclose(relative_velocities(lidar, pose(-1.0, 0.0), 0.1)[:, 0], [5.0, -10.0, -10.0])
+
+
+def test_a_motion_is_carried_on_from_poses_that_tell_it():
+    buffer, noise = PoseBuffer(), np.random.default_rng(0)
+    # poses 200 times a second, off by a millimetre: two neighbours would be off by 0.4 m/s
+    for i in range(41):
+        buffer.add(0.005 * i, pose(10 * 0.005 * i + noise.normal(0, 0.001), 0.0))
+    assert buffer.at(0.4)[0, 3] == pytest.approx(4.0, abs=0.01)

@@ -19,7 +19,7 @@ def paper(*arguments):
 @pytest.fixture(scope="module")
 def kitti(tmp_path_factory):
     root = tmp_path_factory.mktemp("kitti") / "sim"
-    result = CliRunner().invoke(app, ["simulate", str(root), "--frames", "3", "--preset", "train_kitti"])
+    result = CliRunner().invoke(app, ["simulate", str(root), "--frames", "2", "--preset", "train_mono"])
     assert result.exit_code == 0, result.output
     return root
 

@@ -210,12 +210,16 @@ def test_shards_cover_all_frames_once() -> None:
     assert frames_of_shard(ids[:1], "1/2") == ()
 
 
-@pytest.mark.parametrize("form", ["folder", "parquet"])
-def test_spawned_processes_give_the_same_bytes(
-    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, form: str
+@pytest.mark.parametrize(("method", "form"), [("spawn", "folder"), ("forkserver", "parquet"), ("fork", "parquet")])
+def test_processes_of_any_kind_give_the_same_bytes(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, method: str, form: str
 ) -> None:
+    if method not in multiprocessing.get_all_start_methods():
+        pytest.skip(f"this system cannot {method}")
+    # two shards, so that both processes have one
+    monkeypatch.setattr("lcf3d.run.frames.SHARD_FRAMES", 6)
     one = fused(root, tmp_path / "one", form=form)
-    monkeypatch.setattr("lcf3d.run.frames.get_start_method", lambda allow_none: "spawn")
+    monkeypatch.setattr("lcf3d.run.frames.get_start_method", lambda allow_none: method)
     two = fused(root, tmp_path / "two", form=form, jobs=2)
     assert content(one, "provenance", "data", "detections") == content(two, "provenance", "data", "detections")
     assert multiprocessing.active_children() == []
@@ -255,11 +259,14 @@ def test_labels_for_other_tools(root: Path, tmp_path: Path) -> None:
     assert prediction["result"][0]["value"]["rectanglelabels"] == [one.detections.class_names[one.detections.labels[0]]]
 
 
-def test_exports_that_do_not_fit_are_refused(root: Path, tmp_path: Path) -> None:
+def test_exports_that_do_not_fit_are_refused(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run = fused(root, tmp_path / "run")
     data = open_dataset(f"toy:{root / 'data'}")
     with pytest.raises(ConfigError, match="--to takes folder, parquet, coco"):
         export_run(run, data, "tfrecord", tmp_path / "x")
+    with pytest.raises(ConfigError, match="class 'person' is none of nuScenes"):
+        export_run(run, data, "nuscenes", tmp_path / "x")
+    monkeypatch.setattr("lcf3d.run.export.NUSCENES_CLASSES", ("car", "person"))
     with pytest.raises(lcf3d.Lcf3dError, match="no pose"):
         export_run(run, data, "nuscenes", tmp_path / "x")
     with pytest.raises(ConfigError, match="is a folder"):

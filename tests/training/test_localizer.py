@@ -112,8 +112,8 @@ def test_corners_of_a_box_turned_by_half_a_turn_are_as_good():
 
 @pytest.mark.parametrize("form", ["v1", "v2"])
 def test_both_forms_learn_and_resume_as_if_nothing_had_happened(pool, tmp_path, form):
-    task = LocalizerTask(LocalizerSpec.of(form, "kitti"), pool, pool[:4], batch_size=4)
-    settings = TrainingSettings(6, 3e-3, checkpoint_every=2)
+    task = LocalizerTask(LocalizerSpec.of(form, "kitti"), pool, pool[:2], batch_size=2)
+    settings = TrainingSettings(4, 3e-3, checkpoint_every=2)
     losses = []
     whole = train(task, settings, tmp_path / "whole", report=lambda p: losses.append(p.loss))
     assert np.isfinite(losses).all()

@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lcf3d.errors import ConfigError, DetectorError
+from lcf3d.errors import ConfigError, DatasetError, DetectorError
+from lcf3d.processes import LOCK
 
 torch = pytest.importorskip("torch")
 
@@ -104,6 +105,37 @@ def test_a_folder_in_use_other_settings_and_other_networks_are_refused(tmp_path)
     (tmp_path / LAST).write_bytes(b"torn")
     with pytest.raises(DetectorError, match="damaged"):
         train(Line(), SETTINGS, tmp_path, resume=True)
+
+
+def test_a_folder_that_another_process_trains_in_is_refused(tmp_path):
+    fcntl = pytest.importorskip("fcntl")
+    with (tmp_path / LOCK).open("w+") as held:
+        held.write("process 7")
+        held.flush()
+        fcntl.flock(held, fcntl.LOCK_EX)
+        with pytest.raises(ConfigError, match="is being written by process 7: wait"):
+            train(Line(), SETTINGS, tmp_path)
+    assert not (tmp_path / LAST).exists()
+    train(Line(), SETTINGS, tmp_path)
+    assert not (tmp_path / LOCK).exists()
+
+
+@pytest.mark.parametrize("error", [OSError(28, "No space left on device"), RuntimeError("unexpected pos 128 vs 22")])
+def test_a_full_disk_leaves_the_last_checkpoint_and_says_how_to_go_on(tmp_path, monkeypatch, error):
+    whole = train(Line(), SETTINGS, tmp_path / "whole")
+    save = torch.save
+
+    def full(state, path):
+        if state["step"] == 20:
+            raise error
+        save(state, path)
+
+    monkeypatch.setattr(torch, "save", full)
+    with pytest.raises(DatasetError, match=r"cannot write .*last.pt: (no space|unexpected pos).* go on with --resume"):
+        train(Line(), SETTINGS, tmp_path / "full")
+    monkeypatch.undo()
+    assert torch.load(tmp_path / "full" / LAST, weights_only=True)["step"] == 10
+    assert same(train(Line(), SETTINGS, tmp_path / "full", resume=True), whole)
 
 
 def test_a_training_goes_on_with_what_it_began_with_but_for_the_workers(tmp_path):

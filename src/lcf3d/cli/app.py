@@ -76,7 +76,9 @@ def main() -> None:
     try:
         app()
     except Lcf3dError as error:
-        typer.echo(f"error: {error}", err=True)
+        from lcf3d.remote.places import legible
+
+        typer.echo(f"error: {legible(str(error))}", err=True)
         sys.exit(2)
     except OSError as error:
         # no space left, no permission, a folder in the way: the system's own words name the file

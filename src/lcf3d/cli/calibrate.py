@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 if TYPE_CHECKING:
     from lcf3d.evaluation.calibration_study import CalibrationStudy, ClassReport
+    from lcf3d.evaluation.memory_calibration import MemoryReport
     from lcf3d.evaluation.protocol import TableData
     from lcf3d.fusion.calibration import Calibration
 
@@ -27,6 +28,9 @@ def calibrate(
     ] = None,
     set_: Annotated[list[str] | None, typer.Option("--set", help="change a setting, name=value; repeatable")] = None,
     missing: Annotated[str, typer.Option(help="results that are not there: error, or empty")] = "error",
+    memory: Annotated[
+        bool, typer.Option("--memory", help="fit the weights of run --memory too; frames must be of whole drives")
+    ] = False,
     json_: Annotated[bool, typer.Option("--json", help="print the report as JSON")] = False,
 ) -> None:
     """Fit score maps and evidence weights by class, and measure by cross-validation what they bring.
@@ -40,24 +44,33 @@ def calibrate(
 
     from lcf3d.cli.console import console, plain, print_table, tracked
     from lcf3d.evaluation.calibration_study import open_study
+    from lcf3d.evaluation.memory_calibration import MemoryStudy
+    from lcf3d.remote.places import local_file
     from lcf3d.run.setup import RunRequest
 
     request = RunRequest(
         dataset, lidar, {"*": camera}, split, tables, config=config, changes=tuple(set_ or ()), missing=missing
     )
     study = open_study(request, folds, plain if json_ else tracked)
+    drives = MemoryStudy(study) if memory else None
     calibration = study.fit()
+    if drives is not None:
+        calibration = drives.fit(calibration)
     frames = f"{len(study.frames)} frames" + (f" of split {split}" if split else "")
     calibration = calibration.model_copy(update={"source": f"{frames}, {lidar} with {camera}"})
-    calibration.dump(out)
     reports = study.cross_validate(calibration) if folds else []
+    remembered = drives.cross_validate(calibration) if folds and drives is not None else []
+    calibration.dump(local_file(out))
     if json_:
-        values = {"out": str(out), "frames": len(study.frames), "folds": folds}
-        typer.echo(json.dumps({**values, "classes": [asdict(r) for r in reports]}, indent=2))
+        values: dict[str, Any] = {"out": str(out), "frames": len(study.frames), "folds": folds}
+        values |= {"classes": [asdict(r) for r in reports], "memory": [asdict(r) for r in remembered]}
+        typer.echo(json.dumps(values, indent=2))
         return
     print_table(calibration_table(study, calibration))
     if reports:
         print_table(report_table(reports, folds, study.evaluation.heading))
+    if drives is not None:
+        print_table(memory_table(calibration, remembered, folds, study.evaluation.heading))
     console().print(f"wrote {out}; use it with: lcf3d run ... --calibration {out}", soft_wrap=True)
 
 
@@ -103,3 +116,25 @@ def report_table(reports: Sequence[ClassReport], folds: int, heading: str) -> Ta
     columns = ("class", "3D", "2D", "loss", "calib.", "fused", "LiDAR alone", "fused, cross-validated")
     note = f"3D, 2D: detections judged; loss: log loss of scores as they are, calibrated, and fused; then {heading}"
     return TableData(f"cross-validated, {folds} folds", columns, rows, (note,))
+
+
+def memory_table(calibration: Calibration, reports: Sequence[MemoryReport], folds: int, heading: str) -> TableData:
+    """The weights of the memory, and what it brings to each class."""
+    from lcf3d.evaluation.protocol import TableData
+
+    by_name = {report.class_name: report for report in reports}
+    rows: list[tuple[str, ...] | None] = []
+    for name, settings in calibration.memory.items():
+        weights = (settings.seen_weight, settings.missed_weight, settings.base)
+        figures: tuple[str, ...] = ("-",) * 3
+        if name in by_name:
+            report = by_name[name]
+            each = (report.alone, report.default, report.fitted)
+            figures = tuple(" ".join(f"{value:.2f}" for value in values) for values in each)
+        rows.append((name, *(f"{value:.2f}" for value in weights), *figures))
+    columns = ("class", "seen", "missed", "base", "frames alone", "memory, defaults", "memory, fitted")
+    title = f"memory, cross-validated, {folds} folds" if reports else "memory"
+    notes = [f"seen, missed: weights of the past of boxes that the frame has or misses; then {heading}"]
+    if not rows:
+        notes.append("no class has boxes enough: the defaults stay")
+    return TableData(title, columns, rows, tuple(notes))

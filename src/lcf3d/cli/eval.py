@@ -57,6 +57,7 @@ def eval(
     from lcf3d.datasets.base import require_missing
     from lcf3d.datasets.opening import open_dataset
     from lcf3d.evaluation.protocol import EvaluationOptions, open_evaluation
+    from lcf3d.remote.places import local
     from lcf3d.run.conversion import as_files
 
     started = monotonic()
@@ -66,26 +67,24 @@ def eval(
 
         if compare or out is not None:
             raise ConfigError("--tracking measures one result and writes no report; leave out --compare and --out")
-        eval_tracking(dataset, results[0].expanduser(), tuple(class_ or ()), json_)
+        eval_tracking(dataset, local(results[0]), tuple(class_ or ()), json_)
         return
     require_missing(missing)
     options = EvaluationOptions(tuple(class_ or ()), tuple(iou or ()), front, nds_hat)
-    split, frames, whole = _frames_of_run(results[0], split)
+    places = [local(path) for path in results]
+    split, frames, whole = _frames_of_run(places[0], split)
     data = open_dataset(dataset, split=split, version=tables)
     evaluation = open_evaluation(data, frames or (data.ids if whole else None), options)
     names = result_names(results)
-    sets = [
-        evaluation.read(as_files(path.expanduser(), data), name, missing)
-        for path, name in zip(results, names, strict=True)
-    ]
+    sets = [evaluation.read(as_files(path, data), name, missing) for path, name in zip(places, names, strict=True)]
     rows = evaluation.compare(sets[0], sets[1], samples, seed) if compare else []
     studies = [one.study() for one in sets] if json_ or out is not None else []
     content: dict[str, Any] = {"results": [study.to_json() for study in studies]}
     if compare:
         content["comparison"] = {"samples": samples, "seed": seed, "rows": [_row_json(row) for row in rows]}
     if out is not None:
-        origin = report_origin(data, dataset, results, options, monotonic() - started)
-        _write(data, sets, studies, rows, content, out, worst, origin)
+        origin = report_origin(data, dataset, places, options, monotonic() - started)
+        _write(data, sets, studies, rows, content, local(out, new=True), worst, origin)
     if json_:
         typer.echo(json.dumps(content, indent=2))
         return

@@ -24,9 +24,10 @@ def eval_tracking(dataset: str, results: Path, classes: tuple[str, ...], as_json
 
     from lcf3d.cli.console import print_table
     from lcf3d.evaluation.kitti_tracking import CLASSES, evaluate_tracks
+    from lcf3d.remote.places import local
 
     kind, _, root = dataset.partition(":")
-    labels = Path(root).expanduser() / "training" / "label_02"
+    labels = local(root) / "training" / "label_02"
     if kind != "kitti" or not labels.is_dir():
         raise DatasetError(
             f"--tracking needs KITTI's tracking labels, ROOT/training/label_02/SEQUENCE.txt; {dataset} has none"

@@ -26,11 +26,14 @@ def export(
     Example: lcf3d export fused --to parquet --out fused-tables
     """
     from lcf3d.cli.console import console
+    from lcf3d.remote.places import local, local_file
     from lcf3d.run.export import export_run
+    from lcf3d.run.table_folder import FORMS
 
-    folder = run.expanduser()
+    folder = local(run)
     data, _ = dataset_of_run(folder, dataset)
-    count = export_run(folder, data, to, out.expanduser())
+    place = local(out, new=True) if to in FORMS else local_file(out)
+    count = export_run(folder, data, to, place)
     console().print(f"{count} frames in {out}", soft_wrap=True)
 
 

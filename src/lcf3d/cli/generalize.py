@@ -1,4 +1,4 @@
-"""``lcf3d generalize``: detectors on other data than they were trained on, alone and fused (paper section 5.6)."""
+"""``lcf3d generalize``: detectors on other data than they were trained on, alone and fused (paper section 5.8)."""
 
 from __future__ import annotations
 

@@ -17,7 +17,8 @@ def merge(
     Example: lcf3d merge part-1 part-2 part-3 --out fused
     """
     from lcf3d.cli.console import console
+    from lcf3d.remote.places import local
     from lcf3d.run.shards import merge_shards
 
-    count = merge_shards([shard.expanduser() for shard in shards], out.expanduser())
+    count = merge_shards([local(shard) for shard in shards], local(out, new=True))
     console().print(f"{count} frames of {len(shards)} shards in {out}", soft_wrap=True)

@@ -40,7 +40,7 @@ def run(
     set_: Annotated[list[str] | None, typer.Option("--set", help="change a setting, name=value; repeatable")] = None,
     recovery: Annotated[str | None, typer.Option(help="on or off; off needs no scans")] = None,
     localizer: Annotated[
-        str, typer.Option(help="geometric, network, onnx:FILE or frustum-pointnet:CHECKPOINT")
+        str, typer.Option(help="geometric, network, combined, onnx:FILE or frustum-pointnet:CHECKPOINT")
     ] = "geometric",
     tiles: Annotated[
         int, typer.Option(min=1, help="overlapping tiles across wide images, for yolox: and onnx: detectors")
@@ -59,6 +59,9 @@ def run(
         bool, typer.Option("--smooth", help="as --memory, and later frames testify as well; not for live use")
     ] = False,
     jobs: Annotated[int, typer.Option(min=1, help="processes")] = 1,
+    ray: Annotated[
+        str | None, typer.Option(help="on a Ray cluster: its address, or auto for that of this machine")
+    ] = None,
     shard: Annotated[str | None, typer.Option(help="only part i/n of the frames, see 'lcf3d merge'")] = None,
     format_: Annotated[
         str,
@@ -84,6 +87,8 @@ def run(
     """
     import json
 
+    from lcf3d.remote.places import local
+    from lcf3d.remote.urls import is_url, url_of
     from lcf3d.run.frames import total
     from lcf3d.run.setup import RunRequest, prepare_run
 
@@ -109,24 +114,26 @@ def run(
     )
     if format_ not in ("folder", "parquet", *_BAGS):
         raise ConfigError(f"--format takes folder, parquet, {', '.join(_BAGS)}, got {format_!r}")
-    prepared = prepare_run(request, out, resume=resume, overwrite=overwrite)
+    if format_ in _BAGS and is_url(out):
+        raise ConfigError(f"--format {format_} writes a bag on this machine; --out {url_of(out)} is elsewhere")
+    prepared = prepare_run(request, local(out, new=True), resume=resume, overwrite=overwrite)
     sequences = _sequences(prepared) if memory or smooth else None
     pending = (
         [frame_id for frame_id in prepared.frame_ids if not prepared.folder.is_done(frame_id)]
         if sequences is None
         else [frame_id for sequence in sequences for frame_id in sequence]
     )
-    summaries = _fuse(prepared, pending, jobs, sequences, quiet=json_)
+    summaries = _fuse(prepared, pending, jobs, sequences, ray, quiet=json_)
     prepared.folder.finish(prepared.frame_ids)
     if format_ in _BAGS:
-        _write_bag(prepared, out / _BAGS[format_])
+        _write_bag(prepared, prepared.folder.path / _BAGS[format_])
     if pictures:
         _draw(prepared, quiet=json_)
     counts = {
         **total(summaries),
         "left_out": list(prepared.notes),
         "already_done": len(prepared.frame_ids) - len(pending),
-        "out": str(out),
+        "out": url_of(out) or str(out),
     }
     if json_:
         typer.echo(json.dumps(counts, indent=2))
@@ -151,17 +158,17 @@ def _sequences(prepared: Run) -> list[Sequence[str]]:
 
 
 def _fuse(
-    prepared: Run, pending: list[str], jobs: int, sequences: list[Sequence[str]] | None, quiet: bool
+    prepared: Run, pending: list[str], jobs: int, sequences: list[Sequence[str]] | None, ray: str | None, quiet: bool
 ) -> list[FrameSummary]:
     """Run the frames under a progress bar."""
     from rich.progress import Progress
 
-    from lcf3d.run.frames import run_frames
+    from lcf3d.run.ray_workers import fuse_frames
 
     summaries = []
     with Progress(disable=quiet) as progress:
         task = progress.add_task("fusing", total=len(pending))
-        for summary in run_frames(prepared.runner, pending, jobs, sequences):
+        for summary in fuse_frames(prepared, pending, jobs, ray, sequences):
             summaries.append(summary)
             progress.advance(task)
     return summaries

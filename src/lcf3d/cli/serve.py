@@ -23,10 +23,11 @@ def serve(
     from lcf3d.evaluation.protocol import EvaluationOptions, open_evaluation
     from lcf3d.evaluation.server import HOST, report_app
     from lcf3d.evaluation.server import serve as serve_app
+    from lcf3d.remote.places import local
     from lcf3d.run.conversion import as_files
     from lcf3d.run.table_folder import open_run_folder
 
-    folder = run.expanduser()
+    folder = local(run)
     data, name = dataset_of_run(folder, dataset)
     done = set(open_run_folder(folder).frame_ids())
     evaluation = open_evaluation(data, [frame_id for frame_id in data.ids if frame_id in done])

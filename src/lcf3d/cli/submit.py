@@ -21,6 +21,7 @@ def submit(
     """
     from lcf3d.datasets.opening import open_dataset
     from lcf3d.datasets.submission import write_submission_file
+    from lcf3d.remote.places import local, local_file
 
-    frames = write_submission_file(dataset, open_dataset(dataset), results.expanduser(), out.expanduser())
+    frames = write_submission_file(dataset, open_dataset(dataset), local(results), local_file(out))
     typer.echo(f"wrote {out}: {frames:,} frames")

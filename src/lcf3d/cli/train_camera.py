@@ -118,7 +118,7 @@ def _simulated_images(recipe: SampleRecipe, root: Path | None, jobs: int, masks:
 
 def _kitti_images(dataset: str, split: str) -> list[LabelledImage]:
     from lcf3d.datasets.opening import root_of
-    from lcf3d.training.camera import INPUT_SIZE
+    from lcf3d.detectors.camera.small import INPUT_SIZE
     from lcf3d.training.camera_images import read_kitti
 
     _, root = root_of(dataset, ("kitti",), "lcf3d train camera")

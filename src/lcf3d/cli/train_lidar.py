@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 if TYPE_CHECKING:
+    from lcf3d.detectors.fusion.painters import Painter
+    from lcf3d.detectors.lidar.config import LidarConfig
     from lcf3d.training.lidar import LidarTask
     from lcf3d.training.lidar_scans import ScanSource
     from lcf3d.training.samples import SampleRecipe
@@ -39,9 +41,17 @@ def lidar(
     batch_size: Annotated[int, typer.Option(min=1, help="windows a step, 36 m x 38 m each, two of a scan")] = 4,
     learning_rate: Annotated[float, typer.Option(help="highest one of the schedule")] = 3e-3,
     tilt: Annotated[float, typer.Option(min=0, help="degrees that scans are tilted by at most")] = 0.0,
+    paint: Annotated[
+        str,
+        typer.Option(help="PointPainting: what gives points class scores, for example masks:shipped:kitti"),
+    ] = "",
+    frustums: Annotated[
+        str,
+        typer.Option(help="Frustum PointPillars: whose boxes cut frustums, for example shipped:kitti"),
+    ] = "",
     init: Annotated[
-        Path | None, typer.Option(help="last.pt of another training, whose weights this one begins with")
-    ] = None,
+        str, typer.Option(help="weights to begin with: last.pt of another training, lidar.onnx, or shipped:kitti")
+    ] = "",
     seed: Annotated[int, typer.Option(min=0, help="of weights and batches")] = 0,
     checkpoint_every: Annotated[int, typer.Option(min=1, help="steps between checkpoints and validations")] = 500,
     workers: Annotated[int, typer.Option(min=0, help="processes that prepare batches")] = 0,
@@ -58,7 +68,6 @@ def lidar(
     lcf3d train lidar kitti:KITTI --split train --init train-lidar/last.pt --out train-lidar-kitti
     """
     from lcf3d.cli.train_common import held_out_of, train_with_progress
-    from lcf3d.detectors.lidar.presets import COMPACT_KITTI
     from lcf3d.training.lidar import LidarTask, objects_of
     from lcf3d.training.lidar_augmentation import AugmentationSettings
     from lcf3d.training.loop import TrainingSettings, import_torch, require_device
@@ -69,22 +78,26 @@ def lidar(
     if threads:
         torch.set_num_threads(threads)
     recipe = SampleRecipe("lidar", preset, frames, samples_seed, density=density)
-    scans = _scans(dataset, split, version, recipe, samples, jobs)
+    config, painter = _painting(paint, frustums, dataset)
+    start, begin = _beginning(init)
+    scans = _scans(dataset, split, version, recipe, samples, jobs, painter)
     learned, measured = scans.hold_out(held_out_of(scans.count, held_out, 100))
-    objects = objects_of(learned, COMPACT_KITTI)
+    objects = objects_of(learned, config)
     task = LidarTask(
         learned,
         measured.part(0, VALIDATED),
+        config=config,
         batch_size=batch_size,
         augmentation=AugmentationSettings(tilt=math.radians(tilt)),
         objects=objects,
         data=f"{dataset} {split or ''} {version or ''}".strip() if dataset else recipe.folder,
+        begin=begin,
     )
     settings = TrainingSettings(
         steps, learning_rate, seed=seed, average=0.998, checkpoint_every=checkpoint_every, workers=workers
     )
-    network = train_with_progress(task, settings, out, resume, init, device)
-    _write(LidarTask(learned, measured), network, out)
+    network = train_with_progress(task, settings, out, resume, start, device)
+    _write(LidarTask(learned, measured, config=config), network, out)
 
 
 def _write(task: LidarTask, network: Any, out: Path) -> None:
@@ -101,14 +114,48 @@ def _write(task: LidarTask, network: Any, out: Path) -> None:
         typer.echo(f"{name:<20}{figures[name]:>9.3f}" if name in figures else f"{name:<20}{'-':>9}")
 
 
+def _painting(paint: str, frustums: str, dataset: str) -> tuple[LidarConfig, Painter | None]:
+    """The network's configuration, and what gives its points class scores."""
+    from lcf3d.detectors.fusion.frustum_pillars import frustum_painter
+    from lcf3d.detectors.fusion.painters import load_painter
+    from lcf3d.detectors.lidar.presets import COMPACT_KITTI, painted_config
+    from lcf3d.errors import ConfigError
+
+    if not paint and not frustums:
+        return COMPACT_KITTI, None
+    if paint and frustums:
+        raise ConfigError("--paint and --frustums are two networks; train one at a time")
+    if not dataset.startswith("kitti:"):
+        raise ConfigError("painting needs images beside the scans; name a KITTI folder, for example kitti:ROOT")
+    if paint:
+        return painted_config(paint), load_painter(paint, COMPACT_KITTI.class_names)
+    return painted_config(frustums, only_painted=True), frustum_painter(frustums, COMPACT_KITTI.class_names)
+
+
+def _beginning(init: str) -> tuple[Path | None, Path | None]:
+    """A training's checkpoint, or an exported network, that a training begins with."""
+    from lcf3d.detectors.lidar.kinds import shipped_path
+
+    if init.startswith("shipped:"):
+        return None, shipped_path(init.removeprefix("shipped:"))
+    path = Path(init) if init else None
+    return (None, path) if path is not None and path.suffix == ".onnx" else (path, None)
+
+
 def _scans(
-    dataset: str, split: str | None, version: str | None, recipe: SampleRecipe, samples: Path | None, jobs: int
+    dataset: str,
+    split: str | None,
+    version: str | None,
+    recipe: SampleRecipe,
+    samples: Path | None,
+    jobs: int,
+    painter: Painter | None = None,
 ) -> ScanSource:
     from lcf3d.structures import KITTI_CLASSES
     from lcf3d.training.lidar_scans import dataset_scans, simulated_scans
 
     if dataset:
-        return dataset_scans(dataset, split, KITTI_CLASSES, version)
+        return dataset_scans(dataset, split, KITTI_CLASSES, version, painter)
     from lcf3d.cli.train_common import prepare_samples
     from lcf3d.training.recipes import default_samples_root
 

@@ -28,6 +28,9 @@ def view(
     truth: Annotated[bool, typer.Option(help="also draw the ground truth, thin and white")] = True,
     limit: Annotated[int | None, typer.Option(min=1, help="draw at most so many frames")] = None,
     min_score: Annotated[float, typer.Option(help="leave out boxes of a lower score")] = float("-inf"),
+    gif: Annotated[
+        Path | None, typer.Option(help="no pictures but one that moves: a .gif file, with the trails of tracks")
+    ] = None,
     rerun: Annotated[
         str | None,
         typer.Option(help="no pictures but a Rerun recording: a .rrd file, or viewer to open it (run folders)"),
@@ -43,23 +46,34 @@ def view(
 
     lcf3d view kitti:KITTI --frame 000008 --results fused/
 
+    lcf3d view fused/ --limit 100 --gif fused.gif
+
     lcf3d view fused/ --rerun fused.rrd
     """
     from rich.progress import Progress
 
     from lcf3d.datasets.opening import open_dataset
-    from lcf3d.visualization.png import draw_frame, save_png
+    from lcf3d.remote.places import local
+    from lcf3d.visualization.png import draw_frame, save_gif, save_png
 
     run_folder = _run_folder(source)
     if run_folder and results:
         raise ConfigError(f"{source} is a run folder and holds its own results; leave --results out")
     dataset = _open_run(run_folder) if run_folder else open_dataset(source)
-    shown = run_folder or results
+    shown = run_folder or (None if results is None else local(results))
     ids = _frame_ids(dataset, frame or [], shown, limit)
     if rerun is not None:
         _record(dataset, shown, ids, None if rerun == "viewer" else Path(rerun), truth)
         return
     scene_of = _scenes(dataset, shown, truth, min_score, ids[0])
+    if gif is not None:
+        if gif.suffix.lower() != ".gif" or out is not None:
+            raise ConfigError(f"--gif takes a file that ends in .gif and goes without --out, got {gif}")
+        with Progress(disable=len(ids) < 2) as progress:
+            frames = (dataset.frame(frame_id) for frame_id in progress.track(ids, description="drawing"))
+            save_gif(((frame.timestamp, draw_frame(frame, scene_of(frame))) for frame in frames), gif)
+        typer.echo(f"{len(ids)} frames in {gif}")
+        return
     paths = _paths(ids, out, run_folder)
     with Progress(disable=len(ids) < 2) as progress:
         for frame_id in progress.track(ids, description="drawing"):
@@ -73,13 +87,14 @@ def _record(dataset: Dataset, shown: Path | None, ids: Sequence[str], path: Path
     from rich.progress import Progress
 
     from lcf3d.run.folder import RunFolder
+    from lcf3d.run.table_folder import open_run_folder
     from lcf3d.visualization.rerun_log import RerunLog
 
     if shown is None or not RunFolder.is_run(shown):
         raise ConfigError("--rerun shows a run with its reasons: name a folder written by lcf3d run")
     if path is not None and path.suffix != ".rrd":
         raise ConfigError(f"--rerun takes a file that ends in .rrd, or viewer, got {path}")
-    folder = RunFolder(shown)
+    folder = open_run_folder(shown)
     log = RerunLog(path, dataset.used_cameras)
     with Progress(disable=len(ids) < 2) as progress:
         for frame_id in progress.track(ids, description="recording"):
@@ -91,12 +106,14 @@ def _record(dataset: Dataset, shown: Path | None, ids: Sequence[str], path: Path
 
 def _run_folder(source: str) -> Path | None:
     """The path, if it is a folder written by ``lcf3d run``."""
+    from lcf3d.remote.places import local
+    from lcf3d.remote.urls import is_url
     from lcf3d.run.folder import RunFolder
 
-    path = Path(source).expanduser()
+    path = local(source) if is_url(source) else Path(source).expanduser()
     if RunFolder.is_run(path):
         return path
-    if ":" not in source and not path.exists():
+    if (":" not in source or is_url(source)) and not path.exists():
         raise ConfigError(f"{source} does not exist; view takes kind:ROOT or a folder of lcf3d run")
     return None
 
@@ -143,6 +160,7 @@ def _scenes(
     from lcf3d.run.table_folder import open_run_folder
     from lcf3d.structures import Detections3D
     from lcf3d.visualization.scene import Scene
+    from lcf3d.visualization.trails import Trails
 
     if shown is not None and not shown.exists():
         raise ConfigError(f"{shown} does not exist; --results takes a run folder or result files of the dataset's form")
@@ -150,7 +168,13 @@ def _scenes(
         return lambda frame: Scene.from_detections(Detections3D.empty(()), truth=frame.labels if truth else None)
     if RunFolder.is_run(shown):
         folder = open_run_folder(shown)
-        return lambda frame: Scene.from_fused(folder.read(frame.id), frame.labels if truth else None, min_score)
+        trails = Trails()
+
+        def fused_scene(frame: Frame) -> Scene:
+            fused = folder.read(frame.id)
+            return Scene.from_fused(fused, frame.labels if truth else None, min_score, trails(frame, fused))
+
+        return fused_scene
     boxes, flat = _result_readers(dataset, shown, first)
 
     def scene(frame: Frame) -> Scene:

@@ -16,8 +16,9 @@ from lcf3d.structures import ARGOVERSE_CLASSES, Detections3D, Frame
 FILE_NAME = "results.feather"
 
 
-def result_file(path: Path) -> Path:
+def result_file(path: str | Path) -> Path:
     """The feather file that ``path`` is, or that a run folder holds."""
+    path = Path(path).expanduser()
     return path / FILE_NAME if path.is_dir() else path
 
 

@@ -27,7 +27,7 @@ _COLOURS = ((0.34, 0.71, 0.91), (0.0, 0.62, 0.45), (0.9, 0.62, 0.0), (0.8, 0.47,
 
 def write_bag(
     frames: Iterable[Frame],
-    path: Path,
+    path: str | Path,
     fused: Callable[[str], FusedDetections] | None = None,
     detections: Callable[[Frame], tuple[Detections3D, Mapping[str, Detections2D]]] | None = None,
     quality: int | None = 90,
@@ -51,7 +51,7 @@ def write_bag(
         ConfigError: the path exists.
         MissingExtraError: the extra ``bag`` is not installed.
     """
-    writer = BagWriter(path)
+    writer = BagWriter(Path(path).expanduser())
     count = 0
     try:
         for frame in frames:

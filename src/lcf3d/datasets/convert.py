@@ -1,6 +1,6 @@
 """Frames of any dataset written in the KITTI object layout or as nuScenes tables, for cross-dataset evaluation.
 
-Domain shift experiments (paper section 5.6) read one dataset with tools made for the other. Both writers take `Frame`
+Domain shift experiments (paper section 5.8) read one dataset with tools made for the other. Both writers take `Frame`
 objects, so they also serve sensors of one's own.
 """
 
@@ -66,7 +66,11 @@ def nuscenes_labels(labels: Detections3D) -> Detections3D:
 
 
 def write_kitti(
-    frames: Iterable[Frame], root: Path, camera: str, split: str = "val", intensity_scale: float = 1 / _INTENSITY_SCALE
+    frames: Iterable[Frame],
+    root: str | Path,
+    camera: str,
+    split: str = "val",
+    intensity_scale: float = 1 / _INTENSITY_SCALE,
 ) -> dict[str, str]:
     """Write frames in the KITTI object layout, with one camera as the left colour camera.
 
@@ -88,6 +92,7 @@ def write_kitti(
         ConfigError: a frame lacks the camera.
     """
     ids: dict[str, str] = {}
+    root = Path(root).expanduser()
     folder = root / "training"
     for number, frame in enumerate(frames):
         name = f"{number:06d}"
@@ -109,7 +114,7 @@ def write_kitti(
 
 def write_nuscenes(
     frames: Iterable[Frame],
-    root: Path,
+    root: str | Path,
     cameras: Mapping[str, str],
     version: str = "v1.0-converted",
     intensity_scale: float = _INTENSITY_SCALE,
@@ -133,6 +138,7 @@ def write_nuscenes(
     Raises:
         ConfigError: a channel that nuScenes does not have, or two frames of one id.
     """
+    root = Path(root).expanduser()
     unknown = [channel for channel in cameras.values() if channel not in CAMERAS]
     if unknown:
         raise ConfigError(f"nuScenes has no camera {unknown[0]!r}; its cameras are {', '.join(CAMERAS)}")

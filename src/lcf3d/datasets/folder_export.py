@@ -16,7 +16,9 @@ from lcf3d.geometry.rotation import quaternions_from_matrices
 from lcf3d.structures import Camera, FloatArray, Frame
 
 
-def write_folder(frames: Iterable[Frame], root: Path, image_format: Literal["png", "jpg", "webp"] = "png") -> list[str]:
+def write_folder(
+    frames: Iterable[Frame], root: str | Path, image_format: Literal["png", "jpg", "webp"] = "png"
+) -> list[str]:
     """Write scans (``.bin``), images, labels, times, poses and ``sensors.yaml``.
 
     Args:
@@ -30,6 +32,7 @@ def write_folder(frames: Iterable[Frame], root: Path, image_format: Literal["png
     Raises:
         ConfigError: the calibration changes from frame to frame, or a projection is no camera matrix with a pose.
     """
+    root = Path(root).expanduser()
     ids: list[str] = []
     cameras: dict[str, Camera] = {}
     times: list[str] = []

@@ -9,7 +9,7 @@ The LiDAR frame is the Velodyne's: x forward, y left, z up already.
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from pathlib import Path
 
@@ -18,29 +18,24 @@ from numpy.typing import NDArray
 
 from lcf3d.datasets.base import BaseDataset, CameraSource, LidarSource, ResultWriter, require_folder
 from lcf3d.datasets.check import Finding
-from lcf3d.datasets.images import ImageFiles, image_size
-from lcf3d.datasets.kitti_calibration import RAW_CAMERAS, KittiCalibration, read_calibration, read_raw_calibration
+from lcf3d.datasets.images import ImageFiles
+from lcf3d.datasets.kitti_calibration import (
+    CAMERAS,
+    RAW_CAMERAS,
+    KittiCalibration,
+    cameras_of,
+    parse_image_size,
+    read_calibration,
+    read_raw_calibration,
+)
 from lcf3d.datasets.kitti_sequences import FRAMES_PER_S, lidar_pose, sequence_of
-from lcf3d.errors import ConfigError, DatasetError, FormatError
-from lcf3d.files import list_files, shortened
+from lcf3d.errors import DatasetError, FormatError
+from lcf3d.files import list_files
 from lcf3d.formats.kitti import detections_3d, read_frame_ids, read_objects
 from lcf3d.formats.kitti_drives import read_camera_poses
 from lcf3d.formats.scans import read_scan, unit_intensity
-from lcf3d.structures import KITTI_CLASSES, Camera, Detections3D, FloatArray, Frame
+from lcf3d.structures import KITTI_CLASSES, Detections3D, FloatArray, Frame
 
-# (camera name, image folder, projection in the calibration file)
-CAMERAS = (("left", "image_2", "P2"), ("right", "image_3", "P3"))
-# (width, height) of the rectified images of each recording day, known by the focal length that its calibration gave
-IMAGE_SIZES = {
-    721.5377: (1242, 375),
-    707.0493: (1224, 370),
-    718.3351: (1238, 374),
-    707.0912: (1226, 370),
-    718.856: (1241, 376),
-}
-DEFAULT_IMAGE_SIZE = (1242, 375)
-# how far from the middle, as a share of the image, the principal point of an unknown camera may be
-NEAR_MIDDLE = 0.1
 PARTS = ("training", "testing")
 SCANS = (".bin", ".npy")
 IMAGES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".ppm")
@@ -58,83 +53,6 @@ def read_points(path: Path) -> NDArray[np.float32]:
     if bad:
         raise FormatError(f"{path} holds {bad} points with NaN or infinite values; remove them first")
     return unit_intensity(points, path)
-
-
-def _check_image_size(path: Path, size: tuple[int, int], projection: FloatArray) -> None:
-    """Refuse an image that was resized without its calibration: the principal point leaves the middle of the image."""
-    for length, centre, name in zip(size, projection[:2, 2], ("width", "height"), strict=True):
-        if not 0.25 < centre / length < 0.75:
-            raise FormatError(
-                f"{path} is {size[0]} x {size[1]} pixels, but its calibration puts the image centre at "
-                f"({projection[0, 2]:.0f}, {projection[1, 2]:.0f}): wrong {name}; use the original image"
-            )
-
-
-def _require_default_size(name: str, projection: FloatArray) -> None:
-    """Refuse to take a camera without images for one of KITTI's against the evidence of its principal point."""
-    shares = projection[:2, 2] / np.array(DEFAULT_IMAGE_SIZE)
-    if (np.abs(shares - 0.5) > NEAR_MIDDLE).any():
-        x, y = projection[:2, 2]
-        raise FormatError(
-            f"camera {name} has no image, and its calibration (principal point {x:.0f}, {y:.0f}) is none of a "
-            f"{DEFAULT_IMAGE_SIZE[0]} x {DEFAULT_IMAGE_SIZE[1]} image: say the size as "
-            "kitti:ROOT?image_size=WIDTHxHEIGHT, or add the images"
-        )
-
-
-def cameras_of(
-    calibration: KittiCalibration,
-    images: Mapping[str, Path],
-    sizes: Mapping[str, tuple[int, int]],
-    default_size: tuple[int, int] | None = None,
-) -> list[Camera]:
-    """The colour cameras that a calibration describes.
-
-    Args:
-        calibration: of the frame.
-        images: image files by camera name, of which the size is taken.
-        sizes: (width, height) by name of cameras without an image; KITTI's own are known.
-        default_size: of all others; without it KITTI's usual one, if the principal point is near its middle.
-
-    Raises:
-        FormatError: an image that its calibration does not fit, or a camera whose image size nothing tells.
-    """
-    cameras = []
-    for name, _, key in CAMERAS:
-        if key not in calibration.projections:
-            continue
-        matrix = calibration.projections[key]
-        if name in images:
-            size = image_size(images[name])
-            _check_image_size(images[name], size, matrix)
-        else:
-            known = sizes.get(name) or IMAGE_SIZES.get(round(float(matrix[0, 0]), 4)) or default_size
-            if known is None and images:
-                # the two cameras of a pair have images of one size
-                known = image_size(next(iter(images.values())))
-            if known is None:
-                _require_default_size(name, matrix)
-            size = known or DEFAULT_IMAGE_SIZE
-        cameras.append(Camera(name, matrix, calibration.camera_from_lidar, *size))
-    return cameras
-
-
-def parse_image_size(size: tuple[int, int] | str | None) -> tuple[int, int] | None:
-    """(width, height) of ``WIDTHxHEIGHT`` or such a pair.
-
-    Raises:
-        ConfigError: it is neither.
-    """
-    if size is None:
-        return None
-    parts = size.lower().split("x") if isinstance(size, str) else size
-    try:
-        width, height = (int(part) for part in parts)
-    except (TypeError, ValueError):
-        width = height = 0
-    if width < 1 or height < 1:
-        raise ConfigError(f"image_size must read WIDTHxHEIGHT, in pixels, got {shortened(size)!r}")
-    return width, height
 
 
 def is_tracking(root: Path) -> bool:
@@ -166,13 +84,13 @@ class KittiLikeDataset(BaseDataset):
         """3D detections of KITTI result files."""
         from lcf3d.datasets.kitti_results import KittiLidarResults
 
-        return KittiLidarResults(path, class_names, missing)
+        return KittiLidarResults(Path(path), class_names, missing)
 
     def camera_results(self, path: Path, class_names: Sequence[str], missing: str = "error") -> CameraSource:
         """2D detections of KITTI result files."""
         from lcf3d.datasets.kitti_results import KittiCameraResults
 
-        return KittiCameraResults(path, class_names, missing)
+        return KittiCameraResults(Path(path), class_names, missing)
 
     def writer(self, folder: Path) -> ResultWriter:
         """A KITTI result file a frame."""

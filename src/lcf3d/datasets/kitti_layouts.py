@@ -9,8 +9,8 @@ from pathlib import Path
 from lcf3d.datasets.base import require_folder
 from lcf3d.datasets.check import Finding, check_frames
 from lcf3d.datasets.images import ImageFiles
-from lcf3d.datasets.kitti import PARTS, KittiLikeDataset, cameras_of, is_tracking, read_points
-from lcf3d.datasets.kitti_calibration import KittiCalibration
+from lcf3d.datasets.kitti import PARTS, KittiLikeDataset, is_tracking, read_points
+from lcf3d.datasets.kitti_calibration import KittiCalibration, cameras_of
 from lcf3d.datasets.kitti_check import check_results
 from lcf3d.datasets.kitti_drives import Drive, odometry_drives, raw_drives, tracking_drives
 from lcf3d.errors import ConfigError, DatasetError

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -16,8 +17,7 @@ from lcf3d.errors import ConfigError, DatasetError
 from lcf3d.files import inside, list_files
 from lcf3d.formats.kitti import (
     KittiObjects,
-    detections_2d,
-    detections_3d,
+    labels_of,
     objects_from_detections,
     read_folder,
     read_objects,
@@ -25,9 +25,25 @@ from lcf3d.formats.kitti import (
     write_objects,
 )
 from lcf3d.formats.kitti_tracking import write_tracks
+from lcf3d.geometry.boxes import lidar_from_kitti
 from lcf3d.geometry.camera import project_boxes
 from lcf3d.provenance import FusedDetections
-from lcf3d.structures import Detections2D, Detections3D, FloatArray, Frame
+from lcf3d.structures import BoolArray, Detections2D, Detections3D, FloatArray, Frame, IntArray
+
+
+class _Table(NamedTuple):
+    """Lines of many files: the objects, (N,) their labels (-1 for other classes), (N,) whether they have a 3D box."""
+
+    objects: KittiObjects
+    labels: IntArray
+    boxed: BoolArray
+
+
+class _Rows(NamedTuple):
+    """The lines of one frame."""
+
+    table: _Table
+    rows: slice
 
 
 class KittiResults:
@@ -44,7 +60,7 @@ class KittiResults:
         self.folder = path / "data" if (path / "data").is_dir() else path
         self.class_names = tuple(class_names)
         self.missing: Literal["error", "empty"] = "empty" if missing == "empty" else "error"
-        self._frames: dict[str, KittiObjects] = {}
+        self._rows: dict[str, _Rows] = {}
         self.left_out = LeftOut(self.folder)
 
     def load(self, frame_ids: Sequence[str]) -> None:
@@ -61,7 +77,10 @@ class KittiResults:
         for name, target in joined.items():
             if name != target:
                 frames = replace(frames, objects=renamed(frames.objects, name, target))
-        self._frames.update(zip(frame_ids, frames, strict=True))
+        labels = labels_of(frames.objects, self.class_names)
+        table = _Table(frames.objects, labels, frames.objects.has_box3d)
+        bounds = frames.starts.tolist()
+        self._rows.update((i, _Rows(table, slice(*pair))) for i, pair in zip(frame_ids, pairwise(bounds), strict=True))
         if len(frame_ids) > 1 or not self.left_out.taken:
             self._count(frames.objects)
 
@@ -86,23 +105,35 @@ class KittiResults:
         Raises:
             ConfigError: some do not; names the file.
         """
-        for frame_id, objects in self._frames.items():
-            if objects.scores is None:
+        asked = np.array([name not in calibrated for name in self.class_names], dtype=bool)
+        for table in self._tables():
+            scores = table.objects.scores
+            if scores is None:
                 continue
-            taken = np.isin(objects.class_names, [name for name in self.class_names if name not in calibrated])
-            wrong = np.flatnonzero(taken & ~((objects.scores >= 0) & (objects.scores <= 1)))
-            if len(wrong):
-                score, name = objects.scores[wrong[0]], objects.class_names[wrong[0]]
+            wrong = (table.labels >= 0) & asked[table.labels] & ~((scores >= 0) & (scores <= 1))
+            if wrong.any():
+                first = int(wrong.argmax())
+                frame_id = next(i for i, rows in self._rows.items() if rows.table is table and rows.rows.stop > first)
                 raise ConfigError(
-                    f"{self.folder / frame_id}.txt: scores must lie in [0, 1], got {score:.4g} for a {name}; "
-                    "fit a calibration with 'lcf3d calibrate' and pass --calibration FILE"
+                    f"{self.folder / frame_id}.txt: scores must lie in [0, 1], got {scores[first]:.4g} for a "
+                    f"{table.objects.class_names[first]}; fit a calibration with 'lcf3d calibrate' and pass "
+                    "--calibration FILE"
                 )
+
+    def _tables(self) -> Iterator[_Table]:
+        """What `load` has read, each table once."""
+        yield from {id(rows.table): rows.table for rows in self._rows.values()}.values()
 
     def objects(self, frame: Frame) -> KittiObjects:
         """The result lines of one frame, read now unless `load` has read them."""
-        if frame.id not in self._frames:
-            self.load([frame.id])
-        return self._frames[frame.id]
+        table, rows = self._of(frame.id)
+        return table.objects[rows]
+
+    def _of(self, frame_id: str) -> _Rows:
+        """Where the lines of one frame are."""
+        if frame_id not in self._rows:
+            self.load([frame_id])
+        return self._rows[frame_id]
 
 
 class KittiLidarResults(KittiResults):
@@ -114,12 +145,43 @@ class KittiLidarResults(KittiResults):
         Raises:
             DatasetError: the files hold detections, but none with a 3D box.
         """
-        objects = self.objects(frame)
-        if len(objects) and not objects.has_box3d.any():
+        table, rows = self._of(frame.id)
+        boxed = table.boxed[rows]
+        self._require_boxes(frame.id, boxed)
+        kept = _narrowed(rows, boxed & (table.labels[rows] >= 0))
+        objects = table.objects
+        boxes = lidar_from_kitti(
+            objects.locations[kept],
+            objects.dimensions[kept],
+            objects.rotation_y[kept],
+            frame.cameras[0].camera_from_lidar,
+        )
+        assert objects.scores is not None  # of results
+        return Detections3D.trusted(boxes, objects.scores[kept], table.labels[kept], self.class_names)
+
+    def score_range(self, frame_ids: Sequence[str]) -> tuple[float, float]:
+        """Lowest and highest score of what `detect` gives for these frames, 0 and 0 without any.
+
+        Raises:
+            DatasetError: as `detect` does.
+        """
+        low, high = 0.0, 0.0
+        for frame_id in frame_ids:
+            table, rows = self._of(frame_id)
+            boxed = table.boxed[rows]
+            self._require_boxes(frame_id, boxed)
+            assert table.objects.scores is not None  # of results
+            scores = table.objects.scores[_narrowed(rows, boxed & (table.labels[rows] >= 0))]
+            if len(scores):
+                low, high = min(low, float(scores.min())), max(high, float(scores.max()))
+        return low, high
+
+    def _require_boxes(self, frame_id: str, boxed: BoolArray) -> None:
+        """See that some object of a frame has a 3D box, if there are any."""
+        if len(boxed) and not boxed.any():
             raise DatasetError(
-                f"{self.folder / frame.id}.txt holds no 3D boxes: these are 2D results, pass them as the camera branch"
+                f"{self.folder / frame_id}.txt holds no 3D boxes: these are 2D results, pass them as the camera branch"
             )
-        return detections_3d(objects, frame.cameras[0].camera_from_lidar, self.class_names)
 
 
 class KittiCameraResults(KittiResults):
@@ -132,8 +194,8 @@ class KittiCameraResults(KittiResults):
             FormatError: also where the boxes are no pixels.
         """
         super().load(frame_ids)
-        boxes = [self._frames[frame_id].boxes2d for frame_id in frame_ids]
-        if len(boxes) > 1 or len(self._frames) == 1:
+        boxes = [rows.table.objects.boxes2d[rows.rows] for rows in map(self._of, frame_ids)]
+        if len(boxes) > 1 or len(self._rows) == 1:
             require_pixels(np.concatenate(boxes), self.folder)
 
     def sees(self, frame: Frame, camera: str) -> bool:
@@ -142,7 +204,16 @@ class KittiCameraResults(KittiResults):
 
     def detect(self, frame: Frame, camera: str) -> Detections2D:
         """The detections of one frame, clipped to the image of ``camera``."""
-        return detections_2d(self.objects(frame), self.class_names).clipped(frame.camera(camera))
+        table, rows = self._of(frame.id)
+        kept, objects = _narrowed(rows, table.labels[rows] >= 0), table.objects
+        assert objects.scores is not None  # of results
+        found = Detections2D.trusted(objects.boxes2d[kept], objects.scores[kept], table.labels[kept], self.class_names)
+        return found.clipped(frame.camera(camera))
+
+
+def _narrowed(rows: slice, kept: BoolArray) -> slice | IntArray:
+    """Those of the rows that are kept; the slice itself where all are, which copies nothing."""
+    return rows if kept.all() else rows.start + kept.nonzero()[0]
 
 
 class KittiWriter:

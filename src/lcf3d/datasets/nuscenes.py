@@ -280,7 +280,7 @@ class NuscenesDataset(BaseDataset):
             if row >= 0
         }
 
-    def read_results(self, path: Path) -> dict[str, Detections3D]:
+    def read_results(self, path: str | Path) -> dict[str, Detections3D]:
         """Detections of a submission file by sample token, each in its sample's canonical LiDAR frame.
 
         Samples outside this dataset are left out.
@@ -288,11 +288,11 @@ class NuscenesDataset(BaseDataset):
         Raises:
             FormatError: not a submission (`read_submission`).
         """
-        boxes = split_by_sample(read_submission(path)[0])
+        boxes = split_by_sample(read_submission(Path(path))[0])
         return {t: detections_from_global(boxes[t], self.lidar_from_global(t)) for t in self.ids if t in boxes}
 
     def write_results(
-        self, path: Path, detections: Mapping[str, Detections3D], meta: Mapping[str, Any] | None = None
+        self, path: str | Path, detections: Mapping[str, Detections3D], meta: Mapping[str, Any] | None = None
     ) -> None:
         """Write detections, given in canonical LiDAR frames by sample token, as a submission of all samples here.
 
@@ -300,7 +300,7 @@ class NuscenesDataset(BaseDataset):
             FormatError: detections of other samples, or values that are not finite.
         """
         transforms = {token: self.global_from_lidar(token) for token in detections if token in self._position}
-        write_submission(path, global_from_detections(detections, transforms, self.ids), meta)
+        write_submission(Path(path), global_from_detections(detections, transforms, self.ids), meta)
 
     def write_tracks(self, path: Path, detections: Mapping[str, Detections3D], ids: Mapping[str, IntArray]) -> None:
         """Write tracked detections, given in canonical LiDAR frames by sample token, as a tracking submission.

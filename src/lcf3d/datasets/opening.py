@@ -10,6 +10,8 @@ from lcf3d import plugins
 from lcf3d.datasets.base import Dataset, require_folder
 from lcf3d.datasets.check import Finding
 from lcf3d.errors import ConfigError, DatasetError, Lcf3dError
+from lcf3d.remote.places import local
+from lcf3d.remote.urls import is_url
 
 GROUP = "lcf3d.datasets"
 
@@ -52,6 +54,7 @@ def check_dataset(
     Raises:
         Lcf3dError: it cannot be opened, and cannot say by rules what is wrong.
     """
+    results = None if results is None else local(results)
     if results is not None and not results.exists():
         raise DatasetError(f"{results} does not exist; name a file or folder of results")
     try:
@@ -78,13 +81,14 @@ def root_of(text: str, kinds: Sequence[str], what: str) -> tuple[str, Path]:
     spec = named(text)
     if spec.kind not in kinds:
         raise ConfigError(f"{what} reads {' or '.join(f'{kind}:ROOT' for kind in kinds)}, got {text!r}")
-    return spec.kind, require_folder(Path(spec.argument).expanduser())
+    return spec.kind, require_folder(local(spec.argument))
 
 
 def named(text: str) -> plugins.Spec:
     """The parts of a string that names a dataset; the kind of a bare path is told from what lies there."""
-    if Path(text).expanduser().exists():
-        return plugins.Spec(_recognize(Path(text).expanduser()), text)
+    if is_url(text) or Path(text).expanduser().exists():
+        root = local(text)
+        return plugins.Spec(_recognize(root), str(root))
     spec = plugins.parse(text)
     if not spec.argument and spec.kind not in plugins.kinds(GROUP):
         raise DatasetError(f"there is no {text}; name a dataset as {_examples()}")

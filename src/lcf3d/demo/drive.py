@@ -117,6 +117,25 @@ def ground_truth(frame: ShippedFrame) -> Detections3D:
     return Detections3D(boxes[seen], np.ones(int(seen.sum())), labels[seen], KITTI_CLASSES)
 
 
+def demo_frames(count: int = FRAMES, beam_step: int = 1) -> list[Frame]:
+    """Frames of the simulated drive that comes with lcf3d, with image, scan, labels and time; no extra is needed.
+
+    Args:
+        count: the first so many of the 20 frames, a tenth of a second apart.
+        beam_step: keep one in so many of the 64 beams.
+
+    Raises:
+        FormatError: the shipped archive is damaged.
+    """
+    return [_frame(item, i, beam_step) for i, item in enumerate(read_drive(count=count))]
+
+
+def _frame(item: ShippedFrame, number: int, beam_step: int) -> Frame:
+    images = {item.camera.name: item.image}
+    points = every_beam(item.points, beam_step)
+    return Frame(item.id, points, (item.camera,), images, ground_truth(item), number / 10, sequence="demo")
+
+
 def drive(detectors: Detectors, count: int = FRAMES) -> Iterator[dict[str, DemoFrame]]:
     """The first ``count`` moments of the shipped drive: both networks at the same time, then the fusion, by `LIDARS`.
 
@@ -127,26 +146,24 @@ def drive(detectors: Detectors, count: int = FRAMES) -> Iterator[dict[str, DemoF
     fusion = LateCascadeFusion(FusionConfig.preset("kitti"), ShippedLocalizer())
     with ThreadPoolExecutor(2) as pool:
         # compiles or loads what it needs
-        _look(detectors, fusion, shipped[0], 1, pool)
-        for item in shipped:
-            yield {name: _look(detectors, fusion, item, step, pool) for name, step in LIDARS.items()}
+        _look(detectors, fusion, _frame(shipped[0], 0, 1), pool)
+        for i, item in enumerate(shipped):
+            yield {name: _look(detectors, fusion, _frame(item, i, step), pool) for name, step in LIDARS.items()}
 
 
-def _look(
-    detectors: Detectors, fusion: LateCascadeFusion, item: ShippedFrame, step: int, pool: ThreadPoolExecutor
-) -> DemoFrame:
+def _look(detectors: Detectors, fusion: LateCascadeFusion, frame: Frame, pool: ThreadPoolExecutor) -> DemoFrame:
     """One moment through both networks in parallel threads, and the fusion."""
-    points, name, truth = every_beam(item.points, step), item.camera.name, ground_truth(item)
+    points, ((name, image),) = frame.points, frame.images.items()
+    assert points is not None
     started = time.perf_counter()
     lidar = pool.submit(_timed, lambda: detectors.lidar(points))
-    camera = pool.submit(_timed, lambda: detectors.camera([item.image])[0])
+    camera = pool.submit(_timed, lambda: detectors.camera([image])[0])
     (boxes, lidar_ms), (found, camera_ms) = lidar.result(), camera.result()
     spent = {
         "LiDAR network": lidar_ms,
         "camera network": camera_ms,
         "both at once": (time.perf_counter() - started) * 1e3,
     }
-    frame = Frame(item.id, points, (item.camera,), {name: item.image}, truth)
     fused, spent["fusion"] = _timed(partial(fusion, frame, boxes, {name: found}))
     spent["frame"] = (time.perf_counter() - started) * 1e3
     return DemoFrame(frame, boxes, {name: found}, fused, spent)
@@ -187,20 +204,15 @@ def measure(frames: list[DemoFrame]) -> DemoResult:
 
 def write_pictures(frames: Sequence[DemoFrame], folder: Path) -> list[Path]:
     """One PNG a frame and an animation; gives the paths written."""
-    from PIL import Image
-
-    from lcf3d.files import atomic_path
-    from lcf3d.visualization.png import draw_frame, save_png
+    from lcf3d.visualization.png import draw_frame, save_gif, save_png
     from lcf3d.visualization.scene import Scene
 
     pictures, paths = [], []
     for item in frames:
         picture = draw_frame(item.frame, Scene.from_fused(item.fused, item.frame.labels, DRAWN_SCORE))
         paths.append(folder / f"{item.frame.id}.png")
-        save_png(picture, paths[-1], compression=1)
-        # a palette found by median cut takes longer than all the rest
-        pictures.append(picture.reduce(2).quantize(method=Image.Quantize.FASTOCTREE))
+        save_png(picture, paths[-1])
+        pictures.append((None, picture))
     paths.append(folder / "drive.gif")
-    with atomic_path(paths[-1]) as temporary:
-        pictures[0].save(temporary, save_all=True, append_images=pictures[1:], duration=200, loop=0, format="GIF")
+    save_gif(pictures, paths[-1])
     return paths

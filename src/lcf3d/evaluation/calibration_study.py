@@ -69,6 +69,20 @@ class ClassReport:
     after: tuple[float, ...]
 
 
+class FusedScores(NamedTuple):
+    """Scores of all LiDAR detections, each fused by what was fitted on the other folds; NaN for those left out.
+
+    Attributes:
+        equivalents: (N,) on the scale of the LiDAR detector's own scores, comparable between folds.
+        probabilities: (N,) that the box is right.
+        alone: (N,) the same by the LiDAR score alone.
+    """
+
+    equivalents: FloatArray
+    probabilities: FloatArray
+    alone: FloatArray
+
+
 class CalibrationStudy:
     """Detections of two branches and the ground truth of the same frames.
 
@@ -99,7 +113,7 @@ class CalibrationStudy:
     ) -> None:
         self.frames, self.evaluation, self.config, self.folds = list(frames), evaluation, config, folds
         self.lidar_inputs, self.camera_inputs, self.sources = list(lidar), list(camera), sources
-        self._progress = progress
+        self.progress = progress
         if not any(len(found) for found in self.lidar_inputs):
             names = ", ".join(config.class_names)
             raise DatasetError(f"the LiDAR results hold no 3D boxes of {names}: nothing to calibrate")
@@ -152,7 +166,7 @@ class CalibrationStudy:
         fusion = LateCascadeFusion(self.config, _no_localizer, calibration)
         starts = np.concatenate([[0], np.cumsum([len(found) for found in self.lidar_inputs])])
         parts, places = [], []
-        for i in self._progress([int(f) for f in frames]):
+        for i in self.progress([int(f) for f in frames]):
             frame = self.frames[i]
             part = fusion.evidence(frame, self.lidar_inputs[i], self.camera_inputs[i])
             parts.append(part)
@@ -161,7 +175,12 @@ class CalibrationStudy:
         return joined, np.concatenate(places).astype(np.int64)
 
     def cross_validate(self, final: Calibration) -> list[ClassReport]:
-        """Fit on all folds but one, fuse the one, for each; then judge all frames together.
+        """Fit on all folds but one, fuse the one, for each; then judge all frames together."""
+        scores = self.fuse_folds(final)
+        return [self._report(name, *scores) for name in self._present_classes()]
+
+    def fuse_folds(self, final: Calibration) -> FusedScores:
+        """The scores of every fold, fused by what was fitted on the others.
 
         Each fold's model is only defined up to a rising map, so fused log-odds are written in the LiDAR detector's own
         score before folds are put together: within a fold the order is the model's.
@@ -184,7 +203,7 @@ class CalibrationStudy:
                 level = np.where(judged, (fused - evidence.base) / evidence.trust, log_odds)
                 score_map = model.lidar.get(name)
                 equivalents[rows] = score_map.transformed_at(level) if score_map else level
-        return [self._report(name, equivalents, probabilities, alone) for name in self._present_classes()]
+        return FusedScores(equivalents, probabilities, alone)
 
     def rescored(self, scores: FloatArray) -> list[Detections3D]:
         """The LiDAR boxes with other scores, those of NaN left out."""

@@ -13,7 +13,7 @@ from lcf3d.evaluation.center_distance import EvaluationBoxes, class_curves, matc
 from lcf3d.evaluation.reliability import reliability
 from lcf3d.evaluation.study import DISTANCE_RANGES, ClassStudy, DistanceRow, FusionOutcomes, ShownBox, Study
 from lcf3d.geometry.camera import project_boxes
-from lcf3d.provenance import FusedDetections, Outcome, Reason
+from lcf3d.provenance import FusedDetections, Reason
 from lcf3d.structures import BoolArray, Camera, Detections3D, FloatArray, IntArray
 
 MATCH_M = 2.0
@@ -85,40 +85,21 @@ def distance_study(
     above = np.zeros(len(found), dtype=bool)
     missed = np.zeros(len(truth), dtype=bool)
     classes = []
-    for label, class_name in enumerate(results.class_names):
+    for label in range(count):
         objects = np.flatnonzero((truth.labels == label) & truth_near)
         own = np.flatnonzero((found.labels == label) & found_near)
         if not len(objects) and not len(own):
             continue
-        recall, precision, scores = _curve(found.scores[own], matches[own] >= 0, len(objects))
-        threshold = _best_score(recall, precision, scores)
+        curve = _curve(found.scores[own], matches[own] >= 0, len(objects))
+        threshold = _best_score(*curve)
         kept = own[found.scores[own] >= threshold]
         above[kept] = True
         hit = np.zeros(len(truth), dtype=bool)
         hit[matches[kept][matches[kept] >= 0]] = True
         missed[objects] = ~hit[objects]
-        counts = {
-            "true_positives": int((matches[kept] >= 0).sum()),
-            "false_positives": int((matches[kept] < 0).sum()),
-            "misses": int(missed[objects].sum()),
-        }
         point = _Point(label, threshold, kept, objects, matches, missed)
-        classes.append(
-            ClassStudy(
-                class_name,
-                f"centre within {MATCH_M:g} m",
-                "centre distance in metres",
-                _aps(select(truth, objects), select(found, own)),
-                _by_distance(select(truth, objects), select(found, own)),
-                recall,
-                precision,
-                scores,
-                threshold,
-                counts,
-                _fusion_outcomes(results, point, frame_ids, provenance, found) if provenance else None,
-                reliability(found.scores[own], matches[own] >= 0),
-            )
-        )
+        outcomes = _fusion_outcomes(results, point, frame_ids, provenance, found) if provenance else None
+        classes.append(_class_study(results.class_names[label], truth, found, own, point, curve, outcomes))
     wrong = np.bincount(found.frames[above & (matches < 0)], minlength=len(frame_ids))
     lost = np.bincount(truth.frames[missed], minlength=len(frame_ids))
     state = _Drawn(results, above, missed, matches, truth_near)
@@ -145,6 +126,37 @@ class _Point:
     objects: IntArray
     matches: IntArray
     missed: BoolArray
+
+
+def _class_study(
+    class_name: str,
+    truth: EvaluationBoxes,
+    found: EvaluationBoxes,
+    own: IntArray,
+    point: _Point,
+    curve: tuple[FloatArray, FloatArray, FloatArray],
+    outcomes: FusionOutcomes | None,
+) -> ClassStudy:
+    """The closer look at one class: ``own`` are the rows of its detections."""
+    right = point.matches[point.kept] >= 0
+    counts = {
+        "true_positives": int(right.sum()),
+        "false_positives": int((~right).sum()),
+        "misses": int(point.missed[point.objects].sum()),
+    }
+    objects, detections = select(truth, point.objects), select(found, own)
+    return ClassStudy(
+        class_name,
+        f"centre within {MATCH_M:g} m",
+        "centre distance in metres",
+        _aps(objects, detections),
+        _by_distance(objects, detections),
+        *curve,
+        point.threshold,
+        counts,
+        outcomes,
+        reliability(found.scores[own], point.matches[own] >= 0),
+    )
 
 
 def _curve(scores: FloatArray, hits: BoolArray, objects: int) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -198,7 +210,7 @@ def _fusion_outcomes(
         fused = provenance.get(frame_id)
         if fused is None:
             continue
-        origin = output_origins(fused)
+        origin = fused.origins
         for row in point.kept[(point.kept >= starts[f]) & (point.kept < starts[f + 1])]:
             _count(outcomes["right" if point.matches[row] >= 0 else "wrong"], origin[row - starts[f]])
         lost = point.objects[(truth.frames[point.objects] == f) & point.missed[point.objects]]
@@ -222,16 +234,6 @@ def _fusion_outcomes(
     return FusionOutcomes(
         outcomes["right"], outcomes["wrong"], outcomes["dropped_wrong"], outcomes["dropped_right"], misses
     )
-
-
-def output_origins(fused: FusedDetections) -> list[str]:
-    """What the fusion did to each of its outputs, in words."""
-    names = ["kept"] * len(fused.detections)
-    for table in (fused.camera, fused.lidar):
-        for row in np.flatnonzero(table.output >= 0).tolist():
-            lowered = table.reason[row] == Reason.DOWNWEIGHTED
-            names[table.output[row]] = "downweighted" if lowered else Outcome(int(table.outcome[row])).name.lower()
-    return names
 
 
 def _count(counts: dict[str, int], name: str) -> None:

@@ -1,4 +1,4 @@
-"""Detectors on another dataset than the one they were trained on: adaptation and metrics (paper section 5.6).
+"""Detectors on another dataset than the one they were trained on: adaptation and metrics (paper section 5.8).
 
 Everything is evaluated in KITTI's three classes and in the front camera's view, which is all that KITTI annotates.
 """
@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -87,7 +87,7 @@ def find_domain(name: str) -> SensorDomain:
 def adapt_points(
     points: NDArray[np.float32], tested: SensorDomain, trained: SensorDomain, camera: Camera | None = None
 ) -> NDArray[np.float32]:
-    """Points of one dataset as a detector expects them that was trained on the other (paper section 5.6).
+    """Points of one dataset as a detector expects them that was trained on the other (paper section 5.8).
 
     The ground is moved to the height it had in training, intensities are scaled, the time channel is set to zero
     where the data has none and left out where the detector knows none, and the scan is cut to the front camera's view
@@ -122,8 +122,8 @@ def height_shift_m(tested: SensorDomain, trained: SensorDomain) -> float:
     return tested.lidar_height_m - trained.lidar_height_m
 
 
-class AdaptedLidar:
-    """A LiDAR detector of one domain run on frames of another; its boxes come back in the frame's own coordinates.
+class _Adapted:
+    """A detector of one domain run on frames of another; its boxes come back in the frame's own coordinates.
 
     Args:
         detector: the detector.
@@ -132,61 +132,52 @@ class AdaptedLidar:
         camera: name of the front camera.
     """
 
-    def __init__(self, detector: LidarDetector, tested: SensorDomain, trained: SensorDomain, camera: str) -> None:
-        self.detector = detector
+    def __init__(
+        self, detector: LidarDetector | FrameDetector, tested: SensorDomain, trained: SensorDomain, camera: str
+    ) -> None:
+        self.detector: Any = detector
         self.tested = tested
         self.trained = trained
         self.camera = camera
+        self.shift_m = height_shift_m(tested, trained)
 
     def detect(self, frame: Frame) -> Detections3D:
         """Run the detector.
 
         Raises:
-            DatasetError: the frame has no scan.
-        """
-        if frame.points is None:
-            raise DatasetError(f"frame {frame.id} has no scan for the LiDAR detector; give lidar=results:PATH instead")
-        points = adapt_points(frame.points, self.tested, self.trained, frame.camera(self.camera))
-        found = self.detector(points)
-        boxes = found.boxes.copy()
-        boxes[:, 2] -= height_shift_m(self.tested, self.trained)
-        return replace(found, boxes=boxes)
-
-
-class AdaptedFrames:
-    """A detector of points and images of one domain run on frames of another, as `AdaptedLidar` does with points.
-
-    Args:
-        detector: the detector.
-        tested: domain of the frames.
-        trained: domain of the detector.
-        camera: name of the front camera.
-    """
-
-    def __init__(self, detector: FrameDetector, tested: SensorDomain, trained: SensorDomain, camera: str) -> None:
-        self.detector = detector
-        self.tested = tested
-        self.trained = trained
-        self.camera = camera
-
-    def detect(self, frame: Frame) -> Detections3D:
-        """Run the detector.
-
-        Raises:
-            DatasetError: the frame lacks a scan or images.
+            DatasetError: the frame has no scan, or lacks the images that the detector needs.
         """
         if frame.points is None:
             raise DatasetError(f"frame {frame.id} has no scan for the detector; give lidar=results:PATH instead")
-        shift = height_shift_m(self.tested, self.trained)
         points = adapt_points(frame.points, self.tested, self.trained, frame.camera(self.camera))
+        found = self._found(frame, points)
+        boxes = found.boxes.copy()
+        boxes[:, 2] -= self.shift_m
+        return replace(found, boxes=boxes)
+
+    def _found(self, frame: Frame, points: NDArray[np.float32]) -> Detections3D:
+        """What the detector finds in the adapted points."""
+        raise NotImplementedError
+
+
+class AdaptedLidar(_Adapted):
+    """A LiDAR detector of one domain on frames of another, see `adapt_points`."""
+
+    def _found(self, frame: Frame, points: NDArray[np.float32]) -> Detections3D:
+        found: Detections3D = self.detector(points)
+        return found
+
+
+class AdaptedFrames(_Adapted):
+    """A detector of points and images of one domain on frames of another, as `AdaptedLidar` does with points."""
+
+    def _found(self, frame: Frame, points: NDArray[np.float32]) -> Detections3D:
         # the cameras stay where they are while the LiDAR frame moves
         frame_from_moved = np.eye(4)
-        frame_from_moved[2, 3] = -shift
+        frame_from_moved[2, 3] = -self.shift_m
         cameras = [replace(c, camera_from_lidar=c.camera_from_lidar @ frame_from_moved) for c in frame.cameras]
-        found = self.detector.detect_frame(Frame(frame.id, points, cameras, frame.images))
-        boxes = found.boxes.copy()
-        boxes[:, 2] -= shift
-        return replace(found, boxes=boxes)
+        found: Detections3D = self.detector.detect_frame(Frame(frame.id, points, cameras, frame.images))
+        return found
 
 
 def in_kitti_classes(detections: Detections3D) -> Detections3D:

@@ -1,4 +1,4 @@
-"""The tasks of a domain-shift experiment: a detector of one dataset on the frames of another (paper section 5.6)."""
+"""The tasks of a domain-shift experiment: a detector of one dataset on the frames of another (paper section 5.8)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""NDS^: the nuScenes detection score without velocity and attributes, for data of any origin (paper section 5.6).
+"""NDS^: the nuScenes detection score without velocity and attributes, for data of any origin (paper section 5.8).
 
 ``NDS^ = (3 mAP + sum over mATE, mASE, mAOE of (1 - min(1, error))) / 6`` (paper, equation nds_hat). Matching, AP and
 errors are those of nuScenes; boxes are compared in each frame's LiDAR frame, so that KITTI and nuScenes can be set side
@@ -104,7 +104,7 @@ def evaluate_generalization(
         predictions: detected boxes of the same frames in the same order; classes are matched by name.
         class_names: classes to evaluate; None for those of the ground truth.
         cameras: front camera of each frame: boxes whose centre it does not see are left out, annotated and detected
-            alike (paper section 5.6); None for all around.
+            alike (paper section 5.8); None for all around.
         class_range: largest horizontal distance from the LiDAR in metres by class.
 
     Raises:

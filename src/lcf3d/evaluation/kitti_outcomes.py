@@ -15,7 +15,7 @@ from lcf3d.evaluation.kitti_matching import COUNTS, FALSE_POSITIVE, TRUE_POSITIV
 from lcf3d.evaluation.study import FusionOutcomes
 from lcf3d.formats.kitti import KittiFrames, KittiObjects
 from lcf3d.geometry.boxes import kitti_from_lidar
-from lcf3d.provenance import FusedDetections, Outcome, Reason
+from lcf3d.provenance import FusedDetections, Reason
 from lcf3d.run.table_folder import open_run_folder
 from lcf3d.structures import FloatArray, IntArray
 
@@ -122,12 +122,7 @@ def _origins(evaluator: KittiEvaluator, provenance: Mapping[str, FusedDetections
         fused = provenance.get(frame_id)
         if fused is None:
             continue
-        names = np.full(len(fused.detections), "kept", dtype="<U16")
-        for table in (fused.camera, fused.lidar):
-            for row in np.flatnonzero(table.output >= 0).tolist():
-                lowered = table.reason[row] == Reason.DOWNWEIGHTED
-                name = "downweighted" if lowered else Outcome(table.outcome[row]).name.lower()
-                names[table.output[row]] = name
+        names = fused.origins
         for row, output in same_detections(results[f], fused):
             origins[results.starts[f] + row] = names[output]
     return origins

@@ -99,16 +99,19 @@ class KittiEvaluation:
         self, first: Sequence[Detections3D], second: Sequence[Detections3D], samples: int, seed: int = 0
     ) -> dict[str, Interval]:
         """How much the moderate 3D AP of each class is higher in ``second``, with intervals over frames drawn again."""
+        own, other = (self.resampled(results, samples, seed) for results in (first, second))
+        return {
+            name: Interval.of((other[name] - own[name])[0], (other[name] - own[name])[1:]) for name in self.class_names
+        }
+
+    def resampled(self, results: Sequence[Detections3D], samples: int, seed: int = 0) -> dict[str, FloatArray]:
+        """(1 + samples,) moderate 3D AP of each class: on the frames as they are, then on frames drawn again."""
         once = np.ones((1, len(self.frame_ids)), dtype=np.int64)
         weights = np.concatenate([once, frame_weights(len(self.frame_ids), samples, seed)])
-        aps = []
-        for results in (first, second):
-            objects = [result_objects(frame, found) for frame, found in zip(self._frames, results, strict=True)]
-            evaluator = KittiEvaluator(self.truth, KittiFrames.from_frames(self.frame_ids, objects), self.config)
-            events = [evaluator.events(Selection(name, "3d", "moderate")) for name in self.class_names]
-            aps.append([resampled_ap(one, weights)[0] for one in events])
-        rows = zip(self.class_names, *aps, strict=True)
-        return {name: Interval.of((b - a)[0], (b - a)[1:]) for name, a, b in rows}
+        objects = [result_objects(frame, found) for frame, found in zip(self._frames, results, strict=True)]
+        evaluator = KittiEvaluator(self.truth, KittiFrames.from_frames(self.frame_ids, objects), self.config)
+        events = {name: evaluator.events(Selection(name, "3d", "moderate")) for name in self.class_names}
+        return {name: resampled_ap(one, weights)[0] for name, one in events.items()}
 
     def judge_lidar(self, found: Sequence[Detections3D], source: Any = None) -> Verdict:
         """3D detections at the official IoU, ``hard``; lines of result files are taken as they are."""

@@ -202,7 +202,7 @@ def evaluate_nuscenes(
         sample_rows: (S,) rows of the samples to evaluate.
         predictions: boxes in the global frame for exactly these samples.
         config: the official numbers.
-        camera: count only ground truth and predictions whose centre this camera sees (paper section 5.6:
+        camera: count only ground truth and predictions whose centre this camera sees (paper section 5.8:
             ``CAM_FRONT``); None for all around.
         meta: what to carry over into the result.
 

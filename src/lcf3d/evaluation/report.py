@@ -15,7 +15,7 @@ from lcf3d.evaluation.protocol import ComparisonRow, TableData
 from lcf3d.evaluation.report_data import LIMIT_BYTES, report_data
 from lcf3d.evaluation.study import Study
 
-_OUTCOME_COLUMNS = ("matched", "recovered", "downweighted", "kept", "unknown")
+_OUTCOME_COLUMNS = ("matched", "recovered", "downweighted", "kept", "predicted", "unknown")
 
 
 @dataclass(frozen=True)

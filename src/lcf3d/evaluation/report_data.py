@@ -10,7 +10,6 @@ import numpy as np
 
 from lcf3d.datasets.base import Dataset
 from lcf3d.errors import DatasetError
-from lcf3d.evaluation.distance_study import output_origins
 from lcf3d.evaluation.pictures import embedded_image, embedded_scan
 from lcf3d.evaluation.reliability import calibration_error
 from lcf3d.evaluation.study import ClassStudy, ShownBox, Study
@@ -20,7 +19,7 @@ from lcf3d.structures import Camera, FloatArray, Frame
 
 OUTCOMES = ("right", "wrong", "missed", "found", "ignored", "dropped")
 """Of boxes; ``dropped`` are LiDAR detections that the fusion left out."""
-ORIGINS = ("matched", "recovered", "downweighted", "kept")
+ORIGINS = ("matched", "recovered", "downweighted", "kept", "predicted")
 """What the fusion did to its outputs."""
 LIMIT_BYTES = 10_000_000
 """Largest size of a report unless told otherwise."""
@@ -167,7 +166,7 @@ def _frames(
 def _boxes(study: Study, number: int, names: Names) -> list[dict[str, Any]]:
     """The boxes of one frame: class, outcome, score, what the fusion did, box in space, box in the first image."""
     fused = study.fused(number)
-    origins = [] if fused is None else output_origins(fused)
+    origins = [] if fused is None else fused.origins
     rows = []
     for box in study.boxes(number):
         row = _box(names(box.class_name), box.outcome, box.score, box.box3d, box.box2d)

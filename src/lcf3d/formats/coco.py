@@ -104,7 +104,7 @@ def pack_counts(runs: Sequence[int]) -> str:
 
 
 def read_camera_detections(
-    path: Path, class_names: Sequence[str], left_out: LeftOut | None = None, content: Any = None
+    path: str | Path, class_names: Sequence[str], left_out: LeftOut | None = None, content: Any = None
 ) -> CameraDetections:
     """Detections of a simple list (see the module's text) by (sample token, camera), with masks where there are some.
 
@@ -118,7 +118,7 @@ def read_camera_detections(
     return _group(path, records, lambda r: (str(r["sample_token"]), str(r["camera"])), class_names, left_out)
 
 
-def write_camera_detections(path: Path, detections: Mapping[tuple[str, str], Detections2D]) -> None:
+def write_camera_detections(path: str | Path, detections: Mapping[tuple[str, str], Detections2D]) -> None:
     """Write detections by (sample token, camera) as a simple list; masks are not written."""
     records = []
     for (token, camera), found in detections.items():
@@ -265,7 +265,7 @@ def _known(image: Any, images: Mapping[int | str, tuple[str, str]]) -> bool:
     return isinstance(image, int | str) and image in images
 
 
-def _records(path: Path, content: Any = None) -> list[dict[str, Any]]:
+def _records(path: str | Path, content: Any = None) -> list[dict[str, Any]]:
     records = read_json(path) if content is None else content
     if not isinstance(records, list) or not all(isinstance(record, dict) for record in records):
         raise FormatError(f"{path} must hold a list of detections, got {type(records).__name__}")
@@ -273,7 +273,7 @@ def _records(path: Path, content: Any = None) -> list[dict[str, Any]]:
 
 
 def _group(
-    path: Path, records: list[dict[str, Any]], key: Any, class_names: Sequence[str], left_out: LeftOut | None
+    path: str | Path, records: list[dict[str, Any]], key: Any, class_names: Sequence[str], left_out: LeftOut | None
 ) -> CameraDetections:
     """Detections of ``records`` by ``key``."""
     names = tuple(class_names)

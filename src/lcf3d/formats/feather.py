@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from lcf3d.errors import FormatError, MissingExtraError
 from lcf3d.files import atomic_path, reading, require_file, shortened
+from lcf3d.remote.places import fetched
 
 TEXT = np.dtype(object)
 """The type to ask for in `read_columns` where a column holds text."""
@@ -30,7 +31,7 @@ def read_columns(path: Path, columns: Mapping[str, Any], optional: tuple[str, ..
         MissingExtraError: pyarrow is not installed.
     """
     arrow = _arrow("reading feather files")
-    if not path.exists():
+    if not fetched(path).exists():
         raise FormatError(f"{path} does not exist")
     require_file(path)
     try:

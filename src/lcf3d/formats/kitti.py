@@ -8,6 +8,7 @@ bottom centre of the box in the rectified reference camera (x right, y down, z f
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -30,6 +31,11 @@ from lcf3d.geometry.boxes import kitti_from_lidar, lidar_from_kitti, observation
 from lcf3d.structures import Detections2D, Detections3D, FloatArray, IntArray
 
 NO_ANGLE = -10.0
+
+# the numbers between class and score
+_NUMBERS = " ".join(["%.4f"] * 14) + "\n"
+_TRAILING = re.compile(r"\.?0+(?=\s)")
+_ZERO = re.compile(r"(?<!\S)-0(?=\s)")
 
 _Missing = Literal["error", "empty"]
 
@@ -229,25 +235,28 @@ def write_objects(path: Path, objects: KittiObjects) -> None:
 
 def format_objects(objects: KittiObjects) -> str:
     """The text of a KITTI file, one line an object: lengths to 0.1 mm, pixels to 1e-4, scores to 8 digits."""
-    lines = []
-    with_box3d = objects.has_box3d
-    for i in range(len(objects)):
-        fields = [str(objects.class_names[i]), _number(objects.truncated[i]), str(int(objects.occluded[i]))]
-        fields += [_number(objects.alpha[i]), *map(_number, objects.boxes2d[i])]
-        if with_box3d[i]:
-            box = (*objects.dimensions[i], *objects.locations[i], objects.rotation_y[i])
-        else:
-            box = (*(NO_SIZE,) * 3, *(NO_LOCATION,) * 3, NO_ANGLE)
-        fields += map(_number, box)
-        if objects.scores is not None:
-            fields.append(f"{objects.scores[i]:.8g}")
-        lines.append(" ".join(fields) + "\n")
-    return "".join(lines)
+    n = len(objects)
+    if not n:
+        return ""
+    numbers = np.empty((n, 14))
+    numbers[:, 0], numbers[:, 1], numbers[:, 2] = objects.truncated, objects.occluded, objects.alpha
+    numbers[:, 3:7], numbers[:, 7:10] = objects.boxes2d, objects.dimensions
+    numbers[:, 10:13], numbers[:, 13] = objects.locations, objects.rotation_y
+    flat = ~objects.has_box3d
+    if flat.any():
+        numbers[flat, 7:] = (*(NO_SIZE,) * 3, *(NO_LOCATION,) * 3, NO_ANGLE)
+    # all numbers of the file at once: to four decimals, then without trailing zeros
+    written = _ZERO.sub("0", _TRAILING.sub("", (_NUMBERS * n) % tuple(numbers.ravel().tolist())))
+    lines = zip(objects.class_names.tolist(), written.splitlines(), strict=True)
+    if objects.scores is None:
+        return "".join(f"{name} {row}\n" for name, row in lines)
+    scores = objects.scores.tolist()
+    return "".join(f"{name} {row} {score:.8g}\n" for (name, row), score in zip(lines, scores, strict=True))
 
 
 def detections_2d(objects: KittiObjects, class_names: Sequence[str]) -> Detections2D:
     """The 2D boxes of the objects whose class is in ``class_names``; labels get score 1."""
-    labels = _labels(objects, class_names)
+    labels = labels_of(objects, class_names)
     kept = labels >= 0
     scores = np.ones(len(objects)) if objects.scores is None else objects.scores
     return Detections2D(objects.boxes2d[kept], scores[kept], labels[kept], tuple(class_names))
@@ -261,7 +270,7 @@ def detections_3d(objects: KittiObjects, camera_from_lidar: FloatArray, class_na
         camera_from_lidar: (4, 4) rectified reference camera from LiDAR, ``R0_rect @ Tr_velo_to_cam``.
         class_names: classes to keep; labels index them. Ground truth gets score 1.
     """
-    labels = _labels(objects, class_names)
+    labels = labels_of(objects, class_names)
     kept = (labels >= 0) & objects.has_box3d
     boxes = lidar_from_kitti(
         objects.locations[kept], objects.dimensions[kept], objects.rotation_y[kept], camera_from_lidar
@@ -322,18 +331,12 @@ def renamed(objects: KittiObjects, name: str, target: str) -> KittiObjects:
     return replace(objects, class_names=np.array([target if n == name else n for n in names], dtype=np.str_))
 
 
-def _labels(objects: KittiObjects, class_names: Sequence[str]) -> IntArray:
+def labels_of(objects: KittiObjects, class_names: Sequence[str]) -> IntArray:
     """(N,) index of each object's class in ``class_names``, -1 for the others."""
     labels = np.full(len(objects), -1, dtype=np.int64)
     for i, name in enumerate(class_names):
         labels[objects.class_names == name] = i
     return labels
-
-
-def _number(value: float) -> str:
-    """``value`` to four decimals, without trailing zeros."""
-    text = f"{value:.4f}".rstrip("0").rstrip(".")
-    return "0" if text == "-0" else text
 
 
 def _starts(counts: Sequence[int]) -> IntArray:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from lcf3d.errors import FormatError
 from lcf3d.files import read_text
-from lcf3d.formats.kitti import KittiObjects
+from lcf3d.formats.kitti import KittiObjects, objects_from_table
 from lcf3d.formats.kitti_text import parse_tracking
 from lcf3d.geometry.boxes import wrap_angle
 from lcf3d.geometry.rotation import rotation_matrices
@@ -129,21 +129,8 @@ def read_tracking_labels(path: Path) -> dict[int, TrackedObjects]:
     found = {}
     for frame in np.unique(frames).tolist():
         rows = frames == frame
-        found[frame] = TrackedObjects(_objects(names[rows], values[rows]), tracks[rows])
+        found[frame] = TrackedObjects(objects_from_table(names[rows], values[rows]), tracks[rows])
     return found
-
-
-def _objects(names: NDArray[np.str_], values: FloatArray) -> KittiObjects:
-    return KittiObjects(
-        names,
-        values[:, 0],
-        values[:, 1].astype(np.int64),
-        values[:, 2],
-        values[:, 3:7],
-        values[:, 7:10],
-        values[:, 10:13],
-        values[:, 13],
-    )
 
 
 @dataclass(frozen=True, eq=False)

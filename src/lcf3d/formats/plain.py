@@ -18,12 +18,12 @@ from lcf3d.files import read_json, write_json
 from lcf3d.structures import Detections2D, Detections3D
 
 
-def write_detections_3d(path: Path, detections: Detections3D) -> None:
+def write_detections_3d(path: str | Path, detections: Detections3D) -> None:
     """Write the 3D detections of a frame."""
     write_json(path, _plain(detections), indent=None)
 
 
-def read_detections_3d(path: Path) -> Detections3D:
+def read_detections_3d(path: str | Path) -> Detections3D:
     """The 3D detections of a frame.
 
     Raises:
@@ -33,12 +33,12 @@ def read_detections_3d(path: Path) -> Detections3D:
     return found
 
 
-def write_detections_2d(path: Path, detections: Mapping[str, Detections2D]) -> None:
+def write_detections_2d(path: str | Path, detections: Mapping[str, Detections2D]) -> None:
     """Write the 2D detections of a frame by camera; masks are not written."""
     write_json(path, {camera: _plain(found) for camera, found in detections.items()}, indent=None)
 
 
-def read_detections_2d(path: Path) -> dict[str, Detections2D]:
+def read_detections_2d(path: str | Path) -> dict[str, Detections2D]:
     """The 2D detections of a frame by camera.
 
     Raises:

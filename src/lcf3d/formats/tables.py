@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from lcf3d.detectors.joins import LeftOut, join_classes
 from lcf3d.errors import FormatError, MissingExtraError
 from lcf3d.files import atomic_path, reading, require_file, shortened
+from lcf3d.remote.places import fetched
 from lcf3d.structures import Detections2D, Detections3D
 
 BOX_3D = ("x", "y", "z", "length", "width", "height", "yaw")
@@ -106,7 +107,7 @@ def _write(path: Path, columns: Mapping[str, list[Any]]) -> None:
 
 def _read(path: Path, texts: Sequence[str], numbers: Sequence[str]) -> dict[str, NDArray[Any]]:
     _, parquet = _parquet("reading parquet tables")
-    if not path.exists():
+    if not fetched(path).exists():
         raise FormatError(f"{path} does not exist")
     require_file(path)
     try:

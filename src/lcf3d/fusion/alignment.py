@@ -35,6 +35,8 @@ NEAREST = 3.0
 BORDER_PX = 4.0
 # spread of an edge: pixels of the detector, share of the 2D box's side, metres of the 3D box
 EDGE_PX, EDGE_SHARE, EDGE_M = 1.0, 0.02, 0.1
+# what a detector believes to move more slowly than this is taken to stand; spread of the velocity of what moves (m/s)
+STANDING, MOVING_SPREAD = 1.5, 0.5
 # residuals of this many standard deviations have half their weight
 CAUCHY = 2.0
 ITERATIONS = 12
@@ -47,6 +49,7 @@ class BoxPairs:
     Attributes:
         corners: (N, 8, 3) corners of the 3D boxes, metres from the camera's centre, in its nominal axes.
         velocities: (N, 3) m/s of the objects as seen from the camera, in its axes; zero where not known.
+        unsure: (N,) m/s that their velocities may be off by (a standard deviation), 0 for what stands.
         matrices: (N, 3, 3) homogeneous pixels from such corners.
         edges: (N, 4) 2D boxes.
         free: (N, 4) which of their edges are the object's own and not the image's border.
@@ -55,6 +58,7 @@ class BoxPairs:
 
     corners: FloatArray
     velocities: FloatArray
+    unsure: FloatArray
     matrices: FloatArray
     edges: FloatArray
     free: BoolArray
@@ -71,8 +75,12 @@ class BoxPairs:
         camera: Camera,
         velocities: FloatArray | None = None,
         group: int = 0,
+        unsure: FloatArray | None = None,
     ) -> BoxPairs:
-        """Pairs of one frame: (N, 7) LiDAR boxes, (N, 4) 2D boxes, (N, 3) m/s in the LiDAR frame relative to it."""
+        """Pairs of one frame: (N, 7) LiDAR boxes, (N, 4) 2D boxes, (N, 3) m/s in the LiDAR frame relative to it.
+
+        ``unsure`` as in `BoxPairs`; zero without it.
+        """
         rotation, origin = camera.camera_from_lidar[:3, :3], centre_offset(camera)
         corners = box_corners(boxes) @ rotation.T + camera.camera_from_lidar[:3, 3] + origin
         moving = np.zeros((len(boxes), 3)) if velocities is None else np.nan_to_num(velocities)
@@ -84,6 +92,7 @@ class BoxPairs:
         return cls(
             corners,
             moving @ rotation.T,
+            np.zeros(len(boxes)) if unsure is None else unsure,
             _matrices(boxes2d, camera),
             np.asarray(boxes2d, dtype=np.float64),
             free,
@@ -249,6 +258,7 @@ def _edges(pairs: BoxPairs, state: FloatArray) -> tuple[FloatArray, FloatArray]:
     _fill_edges(
         pairs.corners,
         pairs.velocities,
+        np.asarray(pairs.unsure, dtype=np.float64),
         np.array(pairs.matrices),
         pairs.edges,
         focal,
@@ -263,9 +273,15 @@ def _edges(pairs: BoxPairs, state: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 @kernel
 def _fill_edges(  # type: ignore[no-untyped-def]
-    corners, velocities, matrices, edges, focal, spread, turn, state, residuals, jacobian
+    corners, velocities, unsure, matrices, edges, focal, spread, turn, state, residuals, jacobian
 ):
-    """Fill ``residuals`` and ``jacobian``; a box that comes nearer than half a metre keeps NaN."""
+    """Fill ``residuals`` and ``jacobian``; a box that comes nearer than half a metre keeps NaN.
+
+    Both sides of a pair have errors. Derivatives are taken where the edge most likely is, between what is predicted and
+    what was seen: taken at the prediction, its error would be in both factors of the normal equations and pull the time
+    offset. An unsure velocity widens the spread with the offset, whose derivative counts that (Deming's regression):
+    without it every offset would come out too small.
+    """
     turned, homogeneous, moving = np.empty((8, 3)), np.empty((8, 3)), np.empty(3)
     shown, slope = np.empty((2, 8)), np.empty(3)
     for n in range(len(corners)):
@@ -287,10 +303,15 @@ def _fill_edges(  # type: ignore[no-untyped-def]
             c = (sign * shown[a]).argmin()
             z, edge = homogeneous[c, 2], shown[a, c]
             side = edges[n, a + 2] - edges[n, a]
-            sigma = np.sqrt(spread[0] ** 2 + (spread[1] * side) ** 2 + (spread[2] * focal[n, a] / z) ** 2)
-            residuals[n, e] = (edges[n, e] - edge - inward * state[6 + a]) / sigma
+            drift = (unsure[n] * focal[n, a] / z) ** 2
+            predicted = (spread[2] * focal[n, a] / z) ** 2 + state[8] ** 2 * drift
+            sigma = np.sqrt(spread[0] ** 2 + (spread[1] * side) ** 2 + predicted)
+            off = edges[n, e] - edge - inward * state[6 + a]
+            residuals[n, e] = off / sigma
+            jacobian[n, e, 8] = residuals[n, e] * state[8] * drift / sigma**2
+            likely = edge + off * predicted / sigma**2
             for i in range(3):
-                slope[i] = (matrices[n, a, i] - edge * matrices[n, 2, i]) / (z * sigma)
+                slope[i] = (matrices[n, a, i] - likely * matrices[n, 2, i]) / (z * sigma)
                 jacobian[n, e, 3 + i] = slope[i]
                 jacobian[n, e, 8] += slope[i] * moving[i]
             x, y, w = turned[c, 0], turned[c, 1], turned[c, 2]

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lcf3d.fusion.alignment import BORDER_PX, BoxPairs, realigned
+from lcf3d.fusion.alignment import BORDER_PX, MOVING_SPREAD, STANDING, BoxPairs, realigned
 from lcf3d.fusion.clustering import cluster_boxes
 from lcf3d.fusion.matching import assign
 from lcf3d.geometry.camera import pixel_rays, project_boxes
@@ -33,6 +33,7 @@ class Sighting:
         boxes: (N, 7) one 3D box an object, the surest only.
         labels: (N,) their classes.
         velocities: (N, 3) m/s relative to the camera in the LiDAR frame, NaN where not known; or None.
+        unsure: (N,) m/s that those may be off by; or None.
         boxes2d: (M, 4) confident 2D detections.
         labels2d: (M,) their classes.
         votes: (V, 2) pitch and yaw of the camera that each pair of a 3D and a 2D box of like size and class asks for.
@@ -43,6 +44,7 @@ class Sighting:
     boxes: FloatArray
     labels: IntArray
     velocities: FloatArray | None
+    unsure: FloatArray | None
     boxes2d: FloatArray
     labels2d: IntArray
     votes: FloatArray
@@ -72,11 +74,17 @@ class Sighting:
             lidar.boxes[chosen],
             lidar.labels[chosen],
             None if velocities is None else velocities[chosen],
+            None if velocities is None or lidar.velocities is None else _unsure(lidar.velocities[chosen]),
             sure.boxes,
             sure.labels,
             votes,
             group,
         )
+
+
+def _unsure(velocities: FloatArray) -> FloatArray:
+    """(N,) m/s that (N, 2) velocities over ground may be off by: what stands is sure to."""
+    return np.where(np.hypot(*np.nan_to_num(velocities).T) > STANDING, MOVING_SPREAD, 0.0)
 
 
 def _surest(camera: Camera, lidar: Detections3D, count: int) -> tuple[IntArray, FloatArray, float]:
@@ -108,8 +116,9 @@ def match_sighting(sighting: Sighting, state: FloatArray, iou_threshold: float) 
     match = assign(overlap, iou_threshold) if overlap.size else np.full(len(boxes), -1, dtype=np.int64)
     rows = np.flatnonzero(match >= 0)
     velocities = None if sighting.velocities is None else sighting.velocities[rows]
+    unsure = None if sighting.unsure is None else sighting.unsure[rows]
     pairs = BoxPairs.of(
-        sighting.boxes[rows], sighting.boxes2d[match[rows]], sighting.camera, velocities, sighting.group
+        sighting.boxes[rows], sighting.boxes2d[match[rows]], sighting.camera, velocities, sighting.group, unsure
     )
     return pairs, float(overlap[rows, match[rows]].sum())
 

@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 
 from lcf3d.errors import ConfigError
-from lcf3d.fusion.alignment import TIME, Alignment, BoxPairs, fit_alignment, realigned
+from lcf3d.fusion.alignment import SHRINKAGE, TIME, Alignment, BoxPairs, fit_alignment, realigned
 from lcf3d.fusion.alignment_matching import Matcher, Sighting, match_sighting, vote_rotation
 from lcf3d.structures import Camera, Detections2D, Detections3D, FloatArray, Frame
 
@@ -24,6 +24,8 @@ BETTER = 1.1
 CORRELATED = 5
 # with fewer pairs than this nothing is said; the same of time, which a rotation is easily taken for
 FEWEST_PAIRS, FEWEST_TIMED = 12, 60
+# no detector draws its boxes by such a share tighter or wider: matches that ask for it are of other objects
+IMPLAUSIBLE = 0.15
 
 
 @dataclass(frozen=True)
@@ -222,7 +224,7 @@ def _estimate(matchers: list[Matcher], start: Alignment, *, time: bool) -> Align
 
 def judge(alignment: Alignment, settings: WatchSettings) -> Status:
     """What an estimate means: beyond a limit by so many standard deviations, or too uncertain to tell."""
-    if alignment.pairs < FEWEST_PAIRS:
+    if alignment.pairs < FEWEST_PAIRS or np.abs(alignment.state[SHRINKAGE]).max() > IMPLAUSIBLE:
         return "unknown"
     surely = np.rad2deg(alignment.surely_beyond(settings.sure))
     late, late_deviation = 0.0, float(alignment.deviation[TIME])

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from itertools import accumulate
 from typing import NamedTuple
 
 import numpy as np
@@ -25,7 +26,6 @@ class Branches(NamedTuple):
         camera_start: for each of them the row of its first detection in the table of camera decisions.
         lidar_table: decisions so far on all 3D detections given.
         camera_table: decisions so far on all 2D detections given, camera after camera.
-        camera_inputs: for each camera used, the 2D detections given.
         notes: what was missing or left out.
     """
 
@@ -37,7 +37,6 @@ class Branches(NamedTuple):
     camera_start: tuple[int, ...]
     lidar_table: Decisions
     camera_table: Decisions
-    camera_inputs: tuple[Detections2D, ...]
     notes: tuple[str, ...]
 
 
@@ -77,56 +76,64 @@ def prepare_branches(
         for c in frame.cameras
         if c.name not in camera
     ]
-    lidar_table, lidar_index = _select(lidar, config, config.lidar_score_threshold, f"frame {frame.id}: LiDAR")
+    names = config.class_names
+    lidar_table = Decisions.blank(len(lidar))
     lidar_table.lidar[:] = np.arange(len(lidar))
     lidar_table.lidar_score[:] = lidar.scores
+    threshold = config.lidar_score_threshold
+    lidar_index = _select(lidar, names, threshold, lidar_table.reason, f"frame {frame.id}: LiDAR")
     lidar_index = _cap(lidar, lidar_index, lidar_table, config.max_boxes)
 
-    tables, chosen = [], []
-    for c, view in enumerate(cameras):
-        found = camera[view.name]
-        table, index = _select(found, config, config.camera_score_threshold, f"frame {frame.id}, camera {view.name}:")
-        table.camera[:], table.detection[:], table.camera_score[:] = c, np.arange(len(found)), found.scores
-        tables.append(table)
-        chosen.append(index)
+    given = [camera[view.name] for view in cameras]
+    start = [0, *accumulate(map(len, given))]
+    table, chosen = Decisions.blank(start[-1]), []
+    for c, (view, found) in enumerate(zip(cameras, given, strict=True)):
+        rows = slice(start[c], start[c + 1])
+        table.camera[rows], table.detection[rows], table.camera_score[rows] = c, np.arange(len(found)), found.scores
+        who = f"frame {frame.id}, camera {view.name}:"
+        chosen.append(_select(found, names, config.camera_score_threshold, table.reason[rows], who))
     return Branches(
-        lidar=lidar[lidar_index].with_classes(config.class_names),
+        lidar=lidar[lidar_index].with_classes(names),
         lidar_index=lidar_index,
         cameras=tuple(cameras),
-        camera=tuple(camera[v.name][i].with_classes(config.class_names) for v, i in zip(cameras, chosen, strict=True)),
+        camera=tuple(found[index].with_classes(names) for found, index in zip(given, chosen, strict=True)),
         camera_index=tuple(chosen),
-        camera_start=tuple(int(s) for s in np.cumsum([0, *(len(t) for t in tables)])[:-1]),
+        camera_start=tuple(start[:-1]),
         lidar_table=lidar_table,
-        camera_table=_join(tables),
-        camera_inputs=tuple(camera[v.name] for v in cameras),
+        camera_table=table,
         notes=tuple(notes),
     )
 
 
 def _select(
-    detections: Detections2D | Detections3D, config: FusionConfig, threshold: float, who: str
-) -> tuple[Decisions, IntArray]:
-    """A table with the reason of what is left out, and the indices of what takes part."""
-    scores = detections.scores
-    if len(scores) and not (np.min(scores) >= 0 and np.max(scores) <= 1):  # NaN fails both
+    detections: Detections2D | Detections3D, names: tuple[str, ...], threshold: float, reason: IntArray, who: str
+) -> IntArray:
+    """The indices of what takes part; into ``reason`` (N,) why the rest does not."""
+    scores, boxes = detections.scores, detections.boxes
+    if not len(scores):
+        return np.zeros(0, dtype=np.int64)
+    low, high = scores.min(), scores.max()
+    if not (low >= 0 and high <= 1):  # NaN fails both
         raise ConfigError(
-            f"{who} scores must lie in [0, 1], got {np.min(scores):.4g} to {np.max(scores):.4g}; "
+            f"{who} scores must lie in [0, 1], got {low:.4g} to {high:.4g}; "
             "fit a calibration with 'lcf3d calibrate' and pass it"
         )
-    if len(scores) and not set(detections.class_names) & set(config.class_names):
-        raise ConfigError(
-            f"{who} classes {list(detections.class_names)} share no name with the classes to detect "
-            f"{list(config.class_names)}; map them with Detections.with_classes"
-        )
-    table = Decisions.blank(len(detections))
-    wanted = np.array([name in config.class_names for name in detections.class_names], dtype=bool)
-    of_class = wanted[detections.labels] if len(scores) else np.zeros(0, dtype=bool)
-    boxes = detections.boxes
+    takes_part = scores > threshold
+    if detections.class_names != names:
+        if not set(detections.class_names) & set(names):
+            raise ConfigError(
+                f"{who} classes {list(detections.class_names)} share no name with the classes to detect "
+                f"{list(names)}; map them with Detections.with_classes"
+            )
+        of_class = np.array([name in names for name in detections.class_names], dtype=bool)[detections.labels]
+        reason[~of_class] = Reason.OTHER_CLASS
+        takes_part &= of_class
     sides = boxes[:, 3:6] if isinstance(detections, Detections3D) else boxes[:, 2:] - boxes[:, :2]
-    valid = np.isfinite(boxes).all(axis=1) & (sides > 0).all(axis=1)
-    table.reason[~of_class] = Reason.OTHER_CLASS
-    table.reason[~valid] = Reason.INVALID
-    return table, np.flatnonzero(of_class & valid & (scores > threshold))
+    if not (np.isfinite(boxes).all() and (sides > 0).all()):
+        valid = np.isfinite(boxes).all(axis=1) & (sides > 0).all(axis=1)
+        reason[~valid] = Reason.INVALID
+        takes_part &= valid
+    return takes_part.nonzero()[0]
 
 
 def _cap(lidar: Detections3D, index: IntArray, table: Decisions, max_boxes: int) -> IntArray:
@@ -137,11 +144,3 @@ def _cap(lidar: Detections3D, index: IntArray, table: Decisions, max_boxes: int)
     table.reason[index[order[max_boxes:]]] = Reason.TOO_MANY
     kept: IntArray = np.sort(index[order[:max_boxes]])
     return kept
-
-
-def _join(tables: Sequence[Decisions]) -> Decisions:
-    """All rows one after the other."""
-    if not tables:
-        return Decisions.blank(0)
-    columns = Decisions.__dataclass_fields__
-    return Decisions(**{name: np.concatenate([getattr(t, name) for t in tables]) for name in columns})

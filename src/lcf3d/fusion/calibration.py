@@ -7,20 +7,20 @@ frames with the camera as teacher (`lcf3d.fusion.self_calibration`).
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Literal, TypeVar
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from lcf3d.errors import ConfigError
 from lcf3d.files import read_json, write_text
-from lcf3d.fusion.evidence import MAX_LOG_ODDS, Evidence, to_probability
-from lcf3d.structures import Detections2D, Detections3D, FloatArray
+from lcf3d.fusion.evidence import Evidence, to_probability
+from lcf3d.fusion.memory_config import ClassMemory
+from lcf3d.remote.places import local
+from lcf3d.structures import Detections, Detections2D, Detections3D, FloatArray, with_columns
 
 Transform = Literal["identity", "log", "logit"]
-Detections = TypeVar("Detections", Detections2D, Detections3D)
 
 
 def transform_scores(scores: FloatArray, transform: Transform) -> FloatArray:
@@ -84,7 +84,7 @@ class ScoreMap(BaseModel):
 
     def __call__(self, scores: FloatArray) -> FloatArray:
         """(N,) probabilities of (N,) scores."""
-        return to_probability(np.clip(self.log_odds(scores), -MAX_LOG_ODDS, MAX_LOG_ODDS))
+        return to_probability(self.log_odds(scores))
 
 
 class Calibration(BaseModel):
@@ -99,6 +99,8 @@ class Calibration(BaseModel):
         camera_classes: the classes that the camera branch detects at all, None if all: boxes of other classes are not
             judged by it.
         ground_z: height of the ground under the sensor, LiDAR frame, metres; None if unknown.
+        memory: how objects are remembered, by class (``lcf3d calibrate --memory``); classes left out take the defaults
+            of their kind.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -110,6 +112,7 @@ class Calibration(BaseModel):
     evidence: dict[str, Evidence] = Field(default_factory=dict)
     camera_classes: tuple[str, ...] | None = None
     ground_z: float | None = None
+    memory: dict[str, ClassMemory] = Field(default_factory=dict)
 
     @classmethod
     def load(cls, path: Path | str) -> Calibration:
@@ -152,10 +155,10 @@ def _with_probabilities(detections: Detections, maps: Mapping[str, ScoreMap]) ->
         return detections
     scores = detections.scores.copy()
     for label, name in enumerate(detections.class_names):
-        if name in maps:
-            own = detections.labels == label
+        own = detections.labels == label
+        if name in maps and own.any():
             scores[own] = maps[name](scores[own])
-    return replace(detections, scores=scores)
+    return with_columns(detections, scores=scores)
 
 
 def load_calibration(text: str) -> Calibration | None:
@@ -168,7 +171,7 @@ def load_calibration(text: str) -> Calibration | None:
         return None
     if text == "auto":
         raise ConfigError("'auto' calibrates on the frames of a run: see lcf3d.fusion.self_calibration")
-    return Calibration.load(text)
+    return Calibration.load(local(text))
 
 
 def ground_height(bottoms: FloatArray) -> float | None:

@@ -41,7 +41,7 @@ def fit_platt(
     middle, spread = float(x.mean()), max(float(x.std()), 1e-3)
     start = np.array([prior[0] * spread, prior[1] + prior[0] * middle])
     columns = np.stack([(x - middle) / spread, np.ones(len(x))], axis=1)
-    tilt, level = _minimise(columns, right, start, np.full(2, strength / 4), np.array([1e-3 * spread, -np.inf]))
+    tilt, level = minimise_log_loss(columns, right, start, np.full(2, strength / 4), np.array([1e-3 * spread, -np.inf]))
     return tilt / spread, level - tilt * middle / spread
 
 
@@ -140,20 +140,34 @@ def fit_evidence(
     pull[[0, -1]] = 0.01
     lowest = np.zeros(9)
     lowest[-1] = -np.inf
-    weights = _minimise(table / scale, right, start, pull, lowest) / scale
+    weights = minimise_log_loss(table / scale, right, start, pull, lowest) / scale
     # a LiDAR weight of nothing would leave the order of its boxes to chance
     weights[0] = max(weights[0], 0.05)
     return Evidence.from_weights(np.round(weights, 4).astype(np.float64), recovered)
 
 
-def _minimise(
-    columns: FloatArray, right: FloatArray, start: FloatArray, pull: FloatArray, lowest: FloatArray
+def minimise_log_loss(
+    columns: FloatArray,
+    right: FloatArray,
+    start: FloatArray,
+    pull: FloatArray,
+    lowest: FloatArray,
+    offset: FloatArray | float = 0.0,
 ) -> FloatArray:
-    """Logistic regression with a quadratic pull towards ``start`` and lower bounds."""
+    """(K,) weights of a logistic regression with a quadratic pull towards ``start`` and lower bounds.
+
+    Args:
+        columns: (N, K) what is known of each case.
+        right: (N,) 1 or 0.
+        start: (K,) weights without data.
+        pull: (K,) how strongly they pull.
+        lowest: (K,) bounds.
+        offset: (N,) log-odds that are given.
+    """
     from scipy.optimize import minimize
 
     def objective(weights: FloatArray) -> tuple[float, FloatArray]:
-        log_odds = columns @ weights
+        log_odds = columns @ weights + offset
         away = weights - start
         loss = np.logaddexp(0, log_odds) - right * log_odds
         gradient = columns.T @ (to_probability(log_odds) - right) + pull * away

@@ -21,6 +21,7 @@ from lcf3d.fusion.evidence import (
 )
 from lcf3d.fusion.matching import Matches, View
 from lcf3d.geometry.camera import cut_by_field
+from lcf3d.kernels import kernel
 from lcf3d.structures import BoolArray, FloatArray, IntArray
 
 
@@ -57,26 +58,27 @@ def gather_evidence(
         camera_scores[here] = found.scores[matches.detection[here]]
         labels[here] = found.labels[matches.detection[here]]
         plain = miss_exposure(view.boxes[box], camera.width, camera.height)
-        plain = np.where(cut_by_field(view.boxes[box], camera), 0.0, plain)
-        exposure = np.maximum(exposure, np.where(view.visible, plain, 0.0))
+        plain[~view.visible | cut_by_field(view.boxes[box], camera)] = 0.0
+        np.maximum(exposure, plain, out=exposure)
     table = evidence_table(
         to_log_odds(lidar.scores),
         competing_scores(lidar.boxes, lidar.scores, lidar.labels, config),
         ground_slope(lidar.boxes, calibration.ground_z),
         exposure,
         camera_scores,
-        np.where(matches.camera >= 0, np.nan_to_num(matches.iou), 0.0),
+        np.where(matches.camera >= 0, matches.iou, 0.0),
     )
     return ClusterEvidence(box, table, lidar.labels, labels == lidar.labels)
 
 
-def fused_scores(weighed: ClusterEvidence, config: FusionConfig, calibration: Calibration) -> FloatArray:
-    """(C,) probability of every cluster."""
-    scores = np.zeros(len(weighed.box))
-    for label, name in enumerate(config.class_names):
+def fused_scores(weighed: ClusterEvidence, weights: Sequence[FloatArray]) -> FloatArray:
+    """(C,) probability of every cluster, by the weights of its class."""
+    log_odds = np.zeros(len(weighed.box))
+    for label, own_weights in enumerate(weights):
         own = weighed.labels == label
-        scores[own] = to_probability(weighed.table[own] @ evidence_of(name, config, calibration).weights)
-    return scores
+        if own.any():
+            log_odds[own] = weighed.table[own] @ own_weights
+    return to_probability(log_odds)
 
 
 def evidence_of(name: str, config: FusionConfig, calibration: Calibration) -> Evidence:
@@ -95,17 +97,26 @@ def competing_scores(boxes: FloatArray, scores: FloatArray, labels: IntArray, co
     LiDAR detectors report one object under two classes; the paper's cluster-wise suppression would delete the lower,
     here it loses evidence instead.
     """
-    competing = np.zeros(len(boxes))
-    if not config.class_aware or len(np.unique(labels)) < 2:
-        return competing
+    if not config.class_aware or not len(labels) or (labels == labels[0]).all():
+        return np.zeros(len(boxes))
     cluster = cluster_boxes(boxes, scores, labels, method="cliques", iou_threshold=config.cluster_iou).index
-    order = np.lexsort((labels, cluster))
-    starts = np.flatnonzero(np.diff(cluster[order], prepend=-1))
-    sizes = np.diff(np.append(starts, len(order)))
-    for start, size in zip(starts[sizes > 1], sizes[sizes > 1], strict=True):
-        members = order[start : start + size]
-        for i in members:
-            others = members[(labels[members] != labels[i]) & (scores[members] > scores[i])]
-            if len(others):
-                competing[i] = scores[others].max()
+    # copies, because a compiled version for arrays that are read-only would be another one
+    competing: FloatArray = _competing(np.argsort(cluster, kind="stable"), cluster, np.array(scores), np.array(labels))
+    return competing
+
+
+@kernel
+def _competing(order, cluster, scores, labels):  # type: ignore[no-untyped-def]
+    """See `competing_scores`; ``order`` brings the boxes of each cluster together."""
+    competing = np.zeros(len(order))
+    start = 0
+    while start < len(order):
+        end = start + 1
+        while end < len(order) and cluster[order[end]] == cluster[order[start]]:
+            end += 1
+        for i in order[start:end]:
+            for j in order[start:end]:
+                if labels[j] != labels[i] and scores[j] > scores[i]:
+                    competing[i] = max(competing[i], scores[j])
+        start = end
     return competing

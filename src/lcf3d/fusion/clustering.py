@@ -65,15 +65,29 @@ def cluster_boxes(
     """
     if not len(boxes):
         return Clusters(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64))
-    order = np.lexsort((labels, *boxes.T[::-1], -scores))
-    sorted_boxes = np.ascontiguousarray(boxes[order])
-    sorted_labels = np.ascontiguousarray(labels[order])
-    neighbours, offsets = _links(sorted_boxes, sorted_labels, iou_threshold, class_aware)
+    order = np.argsort(-scores, kind="stable")
+    descending = scores[order]
+    if (descending[1:] == descending[:-1]).any():
+        order = np.lexsort((labels, *boxes.T[::-1], -scores))
+    partition, first = _cluster_sorted(boxes[order], labels[order], iou_threshold, class_aware, _CODES[method])
     clusters = np.empty(len(boxes), dtype=np.int64)
-    partition = _partition(neighbours, offsets, _CODES[method])
     clusters[order] = partition
-    numbers, first = np.unique(partition, return_index=True)
-    return Clusters(clusters, order[first[numbers >= 0]])
+    return Clusters(clusters, order[first])
+
+
+@kernel
+def _cluster_sorted(boxes, labels, iou_threshold, class_aware, method):  # type: ignore[no-untyped-def]
+    """Clusters of boxes sorted by descending score, and the first box of each; ``method`` is a code of ``_CODES``."""
+    neighbours, offsets = _links(boxes, labels, iou_threshold, class_aware)
+    partition = _partition(neighbours, offsets, method)
+    first = np.empty(len(boxes), np.int64)
+    count = 0
+    for i in range(len(boxes)):
+        # clusters are numbered in the order of their first boxes
+        if partition[i] == count:
+            first[count] = i
+            count += 1
+    return partition, first[:count]
 
 
 @kernel

@@ -15,7 +15,7 @@ from lcf3d.fusion.recovery import Recovery
 from lcf3d.fusion.semantic import Ensemble, fuse_scores, semantic_fusion
 from lcf3d.geometry.iou import bev_iou
 from lcf3d.provenance import FusedDetections, Outcome, Reason
-from lcf3d.structures import BoolArray, Detections3D, FloatArray, IntArray
+from lcf3d.structures import BoolArray, Detections2D, Detections3D, FloatArray, IntArray, with_columns
 
 
 class ClusterDecisions(NamedTuple):
@@ -129,11 +129,13 @@ def replace_unconfirmed(
     decisions: ClusterDecisions, lidar: Detections3D, recovery: Recovery, duplicate_iou: float
 ) -> ClusterDecisions:
     """Drop clusters kept without confirmation on whose spot a recovered box stands: one object comes out once."""
+    if not len(recovery.found):
+        return decisions
     kept = np.flatnonzero(
         np.isin(decisions.reason, [Reason.UNCONFIRMED, Reason.DOWNWEIGHTED, Reason.CLASS_NOT_DETECTED])
     )
     kept = kept[decisions.outcome[kept] == Outcome.KEPT]
-    if not len(kept) or not len(recovery.found):
+    if not len(kept):
         return decisions
     overlap = bev_iou(lidar.boxes[decisions.box[kept]], recovery.boxes[recovery.found])
     gone = kept[(overlap > duplicate_iou).any(axis=1)]
@@ -150,24 +152,20 @@ def assemble(
     decisions: ClusterDecisions,
     recovery: Recovery,
     notes: Sequence[str],
+    lidar_inputs: Detections3D,
+    camera_inputs: tuple[Detections2D, ...],
 ) -> FusedDetections:
     """Output detections, highest score first, and the reason for every input."""
-    surviving = np.flatnonzero(decisions.outcome != Outcome.DROPPED)
+    surviving = (decisions.outcome != Outcome.DROPPED).nonzero()[0]
     found = recovery.found
-    lidar = branches.lidar[decisions.box[surviving]]
-    detections = Detections3D.concatenate(
-        [
-            Detections3D(
-                lidar.boxes,
-                decisions.scores[surviving],
-                decisions.labels[surviving],
-                lidar.class_names,
-                lidar.velocities,
-                lidar.attributes,
-            ),
-            Detections3D(recovery.boxes[found], recovery.scores[found], recovery.labels[found], lidar.class_names),
-        ]
+    detections = with_columns(
+        branches.lidar[decisions.box[surviving]],
+        scores=decisions.scores[surviving],
+        labels=decisions.labels[surviving],
     )
+    if len(found):
+        recovered = recovery.boxes[found], recovery.scores[found], recovery.labels[found]
+        detections = Detections3D.concatenate([detections, Detections3D(*recovered, detections.class_names)])
     order = np.lexsort((*detections.boxes.T[::-1], -detections.scores))
     place = np.empty(len(order), dtype=np.int64)
     place[order] = np.arange(len(order))
@@ -181,8 +179,8 @@ def assemble(
         detections=detections[order],
         lidar=branches.lidar_table,
         camera=branches.camera_table,
-        lidar_inputs=Detections3D.empty(lidar.class_names),
-        camera_inputs=branches.camera_inputs,
+        lidar_inputs=lidar_inputs,
+        camera_inputs=camera_inputs,
         camera_names=tuple(c.name for c in branches.cameras),
         notes=(*branches.notes, *notes),
     )

@@ -12,7 +12,6 @@ where ``s2d`` and the image IoU are those of the matched 2D detection (zero with
 
 from __future__ import annotations
 
-from itertools import pairwise
 from typing import Annotated, Any
 
 import numpy as np
@@ -132,11 +131,11 @@ def evidence_table(
         camera_scores: (N,) score of the matched 2D detection, 0 without one.
         iou: (N,) image IoU with it, 0 without one.
     """
-    bounds = (0.0, *SUPPORT_IOU)
-    steps = [np.clip((iou - low) / (high - low), 0, 1) for low, high in pairwise(bounds)]
-    unmatched = np.where(iou > 0, 0.0, exposure)
-    columns = [log_odds, -competing, -slope, -unmatched, *(camera_scores * s for s in steps), np.ones(len(iou))]
-    table: FloatArray = np.stack(columns, axis=1)
+    table = np.ones((len(iou), 9))
+    table[:, 0], table[:, 1], table[:, 2] = log_odds, -competing, -slope
+    table[:, 3] = -np.where(iou > 0, 0.0, exposure)
+    low, high = np.array((0.0, *SUPPORT_IOU[:-1])), np.array(SUPPORT_IOU)
+    table[:, 4:8] = camera_scores[:, None] * _within((iou[:, None] - low) / (high - low), 0, 1)
     return table
 
 
@@ -154,7 +153,7 @@ def miss_exposure(projected: FloatArray, width: int, height: int) -> FloatArray:
     low, high = EXPOSURE_HEIGHTS_PX
     tall = np.log(np.maximum(projected[:, 3] - projected[:, 1], 1.0) / low) / np.log(high / low)
     cut = (projected[:, 0] <= 1) | (projected[:, 2] >= width - 2) | (projected[:, 3] >= height - 2)
-    return np.where(cut, 0.0, np.clip(tall, 0, 1))
+    return np.where(cut, 0.0, _within(tall, 0, 1))
 
 
 def ground_slope(boxes: FloatArray, ground_z: float | None) -> FloatArray:
@@ -177,9 +176,15 @@ def ground_slope(boxes: FloatArray, ground_z: float | None) -> FloatArray:
 def to_log_odds(scores: FloatArray) -> FloatArray:
     """Log-odds of probabilities, within ``MAX_LOG_ODDS``."""
     with np.errstate(divide="ignore"):
-        return np.asarray(np.clip(np.log(scores) - np.log1p(-scores), -MAX_LOG_ODDS, MAX_LOG_ODDS))
+        return _within(np.log(scores) - np.log1p(-scores), -MAX_LOG_ODDS, MAX_LOG_ODDS)
 
 
 def to_probability(log_odds: FloatArray) -> FloatArray:
     """The inverse of `to_log_odds`."""
-    return np.asarray(1.0 / (1.0 + np.exp(-np.clip(log_odds, -MAX_LOG_ODDS, MAX_LOG_ODDS))))
+    return np.asarray(1.0 / (1.0 + np.exp(-_within(log_odds, -MAX_LOG_ODDS, MAX_LOG_ODDS))))
+
+
+def _within(values: FloatArray, low: float, high: float) -> FloatArray:
+    """As `numpy.clip`, which takes ten times as long for the few values of a frame."""
+    bounded: FloatArray = np.minimum(np.maximum(values, low), high)
+    return bounded

@@ -57,17 +57,19 @@ def cluster_iou(projected: FloatArray, visible: BoolArray, clusters: Clusters, b
         clusters: their clusters.
         boxes2d: (M, 4) camera detections.
     """
-    result = np.zeros((len(clusters), len(boxes2d)))
-    _fill_cluster_iou(projected, visible, clusters.index, np.array(boxes2d, dtype=np.float64), result)
-    return result
+    iou: FloatArray = _cluster_iou(projected, visible, clusters.index, np.array(boxes2d), len(clusters))[0]
+    return iou
 
 
 @kernel
-def _fill_cluster_iou(projected, visible, cluster_of_box, boxes2d, result):  # type: ignore[no-untyped-def]
-    """Raise ``result`` (C, M) to the IoU of each visible member of each cluster with each 2D box."""
+def _cluster_iou(projected, visible, cluster_of_box, boxes2d, clusters):  # type: ignore[no-untyped-def]
+    """(C, M) the highest IoU of each cluster's visible members with each 2D box; (C,) whether any is visible."""
+    result, seen = np.zeros((clusters, len(boxes2d))), np.zeros(clusters, np.bool_)
     for i in range(len(projected)):
         if not visible[i] or cluster_of_box[i] < 0:
             continue
+        c = cluster_of_box[i]
+        seen[c] = True
         x1, y1, x2, y2 = projected[i, 0], projected[i, 1], projected[i, 2], projected[i, 3]
         area = (x2 - x1) * (y2 - y1)
         for m in range(len(boxes2d)):
@@ -76,8 +78,35 @@ def _fill_cluster_iou(projected, visible, cluster_of_box, boxes2d, result):  # t
             if width > 0.0 and height > 0.0:
                 shared = width * height
                 union = area + (boxes2d[m, 2] - boxes2d[m, 0]) * (boxes2d[m, 3] - boxes2d[m, 1]) - shared
-                c = cluster_of_box[i]
                 result[c, m] = max(result[c, m], shared / union)
+    return result, seen
+
+
+@kernel
+def _assign_undisputed(iou, iou_threshold, match):  # type: ignore[no-untyped-def]
+    """Fill ``match`` (C,) with the one good 2D box of every cluster; False where two claim one and must be weighed."""
+    taken = np.zeros(iou.shape[1], np.bool_)
+    for c in range(iou.shape[0]):
+        for m in range(iou.shape[1]):
+            if iou[c, m] > iou_threshold:
+                if match[c] >= 0 or taken[m]:
+                    return False
+                match[c], taken[m] = m, True
+    return True
+
+
+@kernel
+def _free_iou(iou, allowed, match):  # type: ignore[no-untyped-def]
+    """``iou`` (C, M) of the allowed pairs of which neither is matched yet, else 0."""
+    free, taken = np.zeros(iou.shape), np.zeros(iou.shape[1], np.bool_)
+    for c in range(iou.shape[0]):
+        if match[c] >= 0:
+            taken[match[c]] = True
+    for c in range(iou.shape[0]):
+        for m in range(iou.shape[1]):
+            if allowed[c, m] and match[c] < 0 and not taken[m]:
+                free[c, m] = iou[c, m]
+    return free
 
 
 def assign(iou: FloatArray, iou_threshold: float, method: Assignment = "gated") -> IntArray:
@@ -94,9 +123,12 @@ def assign(iou: FloatArray, iou_threshold: float, method: Assignment = "gated") 
     Returns:
         (C,) index of the 2D detection, or -1.
     """
+    match = np.full(iou.shape[0], -1, dtype=np.int64)
+    if method == "gated" and _assign_undisputed(iou, iou_threshold, match):
+        return match
     from scipy.optimize import linear_sum_assignment
 
-    match = np.full(iou.shape[0], -1, dtype=np.int64)
+    match[:] = -1
     good = iou > iou_threshold
     if not good.any():
         return match
@@ -136,17 +168,13 @@ def match_view(
             all pairs at once if empty.
     """
     projected, visible = project_boxes(boxes, camera)
-    iou = cluster_iou(projected, visible, clusters, boxes2d)
-    seen = np.zeros(len(clusters), dtype=bool)
-    seen[clusters.index[visible & (clusters.index >= 0)]] = True
+    iou, seen = _cluster_iou(projected, visible, clusters.index, np.array(boxes2d), len(clusters))
     if not rounds:
         return View(projected, seen, iou, assign(iou, iou_threshold, method))
     match = np.full(len(clusters), -1, dtype=np.int64)
     for allowed in rounds:
-        free = allowed & (match < 0)[:, None]
-        free[:, match[match >= 0]] = False
-        added = assign(np.where(free, iou, 0.0), iou_threshold, method)
-        match[added >= 0] = added[added >= 0]
+        added = assign(_free_iou(iou, allowed, match), iou_threshold, method)
+        np.maximum(match, added, out=match)
     return View(projected, seen, iou, match)
 
 
@@ -167,7 +195,7 @@ def merge_views(views: Sequence[View], cluster_count: int) -> Matches:
     visible = np.zeros(cluster_count, dtype=bool)
     for v, view in enumerate(views):
         visible |= view.visible
-        matched = np.flatnonzero(view.match >= 0)
+        matched = (view.match >= 0).nonzero()[0]
         iou = view.iou[matched, view.match[matched]]
         better = ~(iou <= best[matched])  # also where there is none yet
         rows = matched[better]
@@ -184,5 +212,7 @@ def confirmed_elsewhere(
     here; it is no candidate for recovery (docs/method.md, matching 7).
     """
     others = (matches.camera >= 0) & (views[at].match < 0)
+    if not others.any():
+        return np.zeros(len(boxes2d), dtype=bool)
     shown = image_iou(views[at].boxes[clusters.representative[others]], boxes2d)
     return np.asarray((shown > iou_threshold).any(axis=0))

@@ -12,6 +12,7 @@ frame's result depends on nothing else. The steps, each a module of its own:
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
@@ -52,7 +53,7 @@ def remember(
     detections = fused.detections
     if frame.timestamp is None:
         return memory, fused
-    if memory is not None and (memory.class_names != detections.class_names or memory.config != config):
+    if memory is not None and not memory.fits(detections.class_names, config):
         raise ConfigError(
             f"frame {frame.id} has classes {list(detections.class_names)} and the memory is of "
             f"{list(memory.class_names)}, or their settings differ; begin a new memory for another configuration"
@@ -128,9 +129,10 @@ def _discontinuity(memory: Memory, frame: Frame, config: MemoryConfig) -> str | 
     pose = _given_pose(memory, frame)
     if pose is None:
         return None
-    moved = invert_rigid(memory.world_from_lidar) @ pose
-    speed = float(np.linalg.norm(moved[:3, 3])) / elapsed
-    turn = float(np.arccos(np.clip((np.trace(moved[:3, :3]) - 1) / 2, -1, 1))) / elapsed
+    moved = (invert_rigid(memory.world_from_lidar) @ pose).tolist()
+    speed = math.hypot(moved[0][3], moved[1][3], moved[2][3]) / elapsed
+    cosine = (moved[0][0] + moved[1][1] + moved[2][2] - 1) / 2
+    turn = math.acos(min(max(cosine, -1.0), 1.0)) / elapsed
     if speed > MAX_EGO_SPEED or turn > MAX_EGO_TURN:
         return f"the pose jumped ({speed:.0f} m/s, {np.degrees(turn):.0f} degrees/s): the memory began anew"
     return None

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from lcf3d.fusion.memory_motion import position_noise
-from lcf3d.fusion.memory_state import Tracks
+from lcf3d.fusion.memory_motion import POSITION_NOISE, POSITION_NOISE_BY_DISTANCE
+from lcf3d.fusion.memory_state import COV, LABEL, POSITION_X, POSITION_Y, Tracks
+from lcf3d.kernels import kernel
 from lcf3d.structures import FloatArray, IntArray
 
 # a pair farther apart than this many standard deviations is none
@@ -30,12 +31,24 @@ def associate(
     match = np.full(len(boxes), -1, dtype=np.int64)
     if not len(tracks) or not len(boxes):
         return match
-    off = boxes[:, None, :2] - tracks.positions[None]
-    squared = (off**2).sum(axis=2)
-    variance = tracks.position_cov[None, :, 0] + position_noise(distances)[:, None] ** 2
-    cost = squared / variance - GATE**2
-    possible = (cost < 0) & (squared < reach[labels][:, None] ** 2) & (labels[:, None] == tracks.labels[None])
-    rows, columns = linear_sum_assignment(np.where(possible, cost, 0.0))
-    good = possible[rows, columns]
+    cost = np.zeros((len(boxes), len(tracks)))
+    _costs(tracks.values, tracks.numbers, boxes, np.array(labels), distances, reach, cost)
+    rows, columns = linear_sum_assignment(cost)
+    good = cost[rows, columns] < 0
     match[rows[good]] = columns[good]
     return match
+
+
+@kernel
+def _costs(values, numbers, boxes, labels, distances, reach, cost):  # type: ignore[no-untyped-def]
+    """Fill ``cost`` (N, T): squared Mahalanobis distance less that of the gate; 0 stays for pairs that are none."""
+    for i in range(len(boxes)):
+        noise = POSITION_NOISE + POSITION_NOISE_BY_DISTANCE * distances[i]
+        longest = reach[labels[i]] * reach[labels[i]]
+        for j in range(len(values)):
+            if labels[i] != numbers[j, LABEL]:
+                continue
+            x, y = boxes[i, 0] - values[j, POSITION_X], boxes[i, 1] - values[j, POSITION_Y]
+            squared = x * x + y * y
+            if squared < longest:
+                cost[i, j] = min(squared / (values[j, COV] + noise * noise) - GATE * GATE, 0.0)

@@ -35,16 +35,13 @@ def frame_support(log_odds: FloatArray) -> FloatArray:
     return np.maximum(log_odds + OFFSET, 0.0)
 
 
-def grown_support(support: FloatArray, last: FloatArray, elapsed_s: float) -> FloatArray:
-    """(T,) support after the last frame is joined to it and ``elapsed_s`` have passed since that frame.
+def fading(elapsed_s: float) -> tuple[float, float]:
+    """In how many units the last frame joins the support of those before it, and what share of all stays.
 
-    Args:
-        support: (T,) of the frames before the last.
-        last: (T,) `frame_support` of the last, 0 where it saw nothing.
-        elapsed_s: time since the last frame.
+    After ``elapsed_s`` since the last frame, support is ``(support + last * units) * share``, where ``last`` is the
+    `frame_support` of the last frame, 0 where it saw nothing.
     """
-    units = min(elapsed_s / UNIT_S, MAX_UNITS)
-    return np.asarray((support + last * units) * np.exp(-elapsed_s / MEMORY_S))
+    return min(elapsed_s / UNIT_S, MAX_UNITS), float(np.exp(-elapsed_s / MEMORY_S))
 
 
 def seen_log_odds(

@@ -3,18 +3,36 @@
 Position noise is taken as equal along both axes, so that one 2 x 2 covariance (three numbers) serves x and y, and a
 step is a handful of operations on whole columns. Yaw and yaw rate have a filter of the same form. What turns (cars,
 riders) has its velocity turned along and drawn towards its heading; people walk where they like.
+
+The loops are compiled. Numbers that numpy's own functions give (exponentials, powers) are handed to them.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from lcf3d.fusion.memory_config import Motion
-from lcf3d.fusion.memory_state import Tracks
-from lcf3d.geometry.boxes import wrap_angle
-from lcf3d.structures import FloatArray, IntArray
+from lcf3d.fusion.memory_evidence import fading
+from lcf3d.fusion.memory_state import (
+    COV,
+    COV_BOTH,
+    COV_RATE,
+    HEADING,
+    LABEL,
+    LAST_SUPPORT,
+    POSITION_X,
+    POSITION_Y,
+    SUPPORT,
+    VELOCITY_X,
+    VELOCITY_Y,
+    YAW_COV,
+    YAW_COV_BOTH,
+    YAW_COV_RATE,
+    YAW_RATE,
+    Tracks,
+)
+from lcf3d.kernels import kernel
+from lcf3d.structures import FloatArray
 
 # standard deviation of a measured position: metres, and metres per metre of distance
 POSITION_NOISE = 0.1
@@ -36,94 +54,112 @@ def position_noise(distances: FloatArray) -> FloatArray:
     return POSITION_NOISE + POSITION_NOISE_BY_DISTANCE * distances
 
 
-def yaw_noise(distances: FloatArray) -> FloatArray:
-    """(N,) standard deviation of measured yaws, radians, at (N,) distances from the sensor."""
-    return YAW_NOISE * (1 + distances / YAW_NOISE_DISTANCE)
-
-
 def predict(tracks: Tracks, elapsed_s: float, motion: Motion) -> Tracks:
-    """The tracks ``elapsed_s`` later, less certain."""
-    turns = motion.turns[tracks.labels]
-    turned = np.where(turns, tracks.yaw_rates * elapsed_s, 0.0)
-    # half of the turn before the way and half after it
-    halfway = _rotated(tracks.velocities, turned / 2)
-    return replace(
-        tracks,
-        positions=tracks.positions + halfway * elapsed_s,
-        velocities=_rotated(halfway, turned / 2),
-        position_cov=_predicted_cov(tracks.position_cov, elapsed_s, motion.acceleration[tracks.labels]),
-        yaws=wrap_angle(tracks.yaws + turned),
-        yaw_rates=tracks.yaw_rates * np.exp(-elapsed_s / YAW_RATE_MEMORY_S),
-        yaw_cov=_predicted_cov(tracks.yaw_cov, elapsed_s, np.full(len(tracks), YAW_ACCELERATION)),
+    """The tracks ``elapsed_s`` later: moved on, less certain, their support faded."""
+    values = np.empty_like(tracks.values)
+    t = float(elapsed_s)
+    powers = (t, t * t, t**3, t**4)
+    yaw_rate_share = float(np.exp(-t / YAW_RATE_MEMORY_S))
+    _predict(
+        tracks.values, tracks.numbers, motion.turns, motion.acceleration, powers, yaw_rate_share, fading(t), values
     )
+    return Tracks(tracks.numbers, values)
 
 
-def measured(tracks: Tracks, boxes: FloatArray, distances: FloatArray, motion: Motion) -> Tracks:
-    """The tracks with position, velocity and yaw corrected by measured boxes.
+@kernel
+def _predict(old, numbers, turns, acceleration, powers, yaw_rate_share, support, new):  # type: ignore[no-untyped-def]
+    """Fill ``new`` with the tracks of ``old`` a while later; ``support`` are the units and the share that stays."""
+    t = powers[0]
+    for i in range(len(old)):
+        new[i] = old[i]
+        label = numbers[i, LABEL]
+        turned = old[i, YAW_RATE] * t if turns[label] else 0.0
+        # half of the turn before the way and half after it
+        cos, sin = np.cos(turned / 2), np.sin(turned / 2)
+        x = cos * old[i, VELOCITY_X] - sin * old[i, VELOCITY_Y]
+        y = sin * old[i, VELOCITY_X] + cos * old[i, VELOCITY_Y]
+        new[i, POSITION_X] = old[i, POSITION_X] + x * t
+        new[i, POSITION_Y] = old[i, POSITION_Y] + y * t
+        new[i, VELOCITY_X] = cos * x - sin * y
+        new[i, VELOCITY_Y] = sin * x + cos * y
+        spread_later(new[i, COV : COV_RATE + 1], powers, acceleration[label])
+        new[i, HEADING] = wrapped(old[i, HEADING] + turned)
+        new[i, YAW_RATE] = old[i, YAW_RATE] * yaw_rate_share
+        spread_later(new[i, YAW_COV : YAW_COV_RATE + 1], powers, YAW_ACCELERATION)
+        new[i, SUPPORT] = (old[i, SUPPORT] + old[i, LAST_SUPPORT] * support[0]) * support[1]
+        new[i, LAST_SUPPORT] = 0.0
+
+
+@kernel(inline="always")
+def spread_later(cov, powers, acceleration):  # type: ignore[no-untyped-def]
+    """Covariance (3,) of value and rate a while later, under white accelerations of that deviation (numba)."""
+    value, both, rate, power = cov[0], cov[1], cov[2], acceleration * acceleration
+    t = powers[0]
+    cov[0] = value + 2 * t * both + powers[1] * rate + power * powers[3] / 4
+    cov[1] = both + t * rate + power * powers[2] / 2
+    cov[2] = rate + power * t * t
+
+
+@kernel(inline="always")
+def wrapped(angle):  # type: ignore[no-untyped-def]
+    """An angle brought into [-pi, pi), as `lcf3d.geometry.boxes.wrap_angle` does (numba)."""
+    result = (angle + np.pi) % (2 * np.pi) - np.pi
+    return -np.pi if result >= np.pi else result
+
+
+@kernel(inline="always")
+def yaw_noise(distance):  # type: ignore[no-untyped-def]
+    """Standard deviation of a measured yaw, radians, at a distance from the sensor (numba)."""
+    return YAW_NOISE * (1 + distance / YAW_NOISE_DISTANCE)
+
+
+@kernel(inline="always")
+def corrected(cov, noise):  # type: ignore[no-untyped-def]
+    """Kalman gains of value and rate for a value measured with that variance; ``cov`` (3,) is then that after it."""
+    value, both = cov[0], cov[1]
+    gain, rate_gain = value / (value + noise), both / (value + noise)
+    cov[0], cov[1], cov[2] = (1 - gain) * value, (1 - gain) * both, cov[2] - rate_gain * both
+    return gain, rate_gain
+
+
+@kernel
+def measure(track, box, distance, turns):  # type: ignore[no-untyped-def]
+    """Correct position, velocity and yaw of one track by a measured box (numba).
 
     Args:
-        tracks: T tracks, predicted to the time of the measurement.
-        boxes: (T, 7) measured boxes in the world frame.
-        distances: (T,) from the sensor, metres.
-        motion: of the classes.
+        track: (21,) row of `Tracks.values`, predicted to the time of the measurement; changed in place.
+        box: (7,) in the world frame.
+        distance: of the box from the sensor, metres.
+        turns: whether the object moves along its heading.
     """
-    noise = position_noise(distances)
-    gain, rate_gain, position_cov = _gains(tracks.position_cov, noise**2)
-    off = boxes[:, :2] - tracks.positions
-    positions = tracks.positions + gain[:, None] * off
-    velocities = tracks.velocities + rate_gain[:, None] * off
+    noise = POSITION_NOISE + POSITION_NOISE_BY_DISTANCE * distance
+    gain, rate_gain = corrected(track[COV : COV_RATE + 1], noise * noise)
+    off_x, off_y = box[0] - track[POSITION_X], box[1] - track[POSITION_Y]
+    track[POSITION_X] += gain * off_x
+    track[POSITION_Y] += gain * off_y
+    x, y = track[VELOCITY_X] + rate_gain * off_x, track[VELOCITY_Y] + rate_gain * off_y
     # a detector may take the front for the rear; the track's own front stays where it is
-    turned = wrap_angle(boxes[:, 6] - tracks.yaws)
-    turned = np.where(np.abs(turned) > np.pi / 2, wrap_angle(turned + np.pi), turned)
-    gain, rate_gain, yaw_cov = _gains(tracks.yaw_cov, yaw_noise(distances) ** 2)
-    yaws = wrap_angle(tracks.yaws + gain * turned)
-    heading = np.stack([np.cos(yaws), np.sin(yaws)], axis=1)
-    along = (velocities * heading).sum(axis=1, keepdims=True) * heading
-    share = np.where(motion.turns[tracks.labels], HEADING_SHARE, 0.0)[:, None]
-    return replace(
-        tracks,
-        positions=positions,
-        velocities=velocities + share * (along - velocities),
-        position_cov=position_cov,
-        yaws=yaws,
-        yaw_rates=np.clip(tracks.yaw_rates + rate_gain * turned, -MAX_YAW_RATE, MAX_YAW_RATE),
-        yaw_cov=yaw_cov,
-    )
+    turned = wrapped(box[6] - track[HEADING])
+    if abs(turned) > np.pi / 2:
+        turned = wrapped(turned + np.pi)
+    noise = yaw_noise(distance)
+    gain, rate_gain = corrected(track[YAW_COV : YAW_COV_RATE + 1], noise * noise)
+    track[HEADING] = wrapped(track[HEADING] + gain * turned)
+    cos, sin = np.cos(track[HEADING]), np.sin(track[HEADING])
+    along = x * cos + y * sin
+    share = HEADING_SHARE if turns else 0.0
+    track[VELOCITY_X] = x + share * (along * cos - x)
+    track[VELOCITY_Y] = y + share * (along * sin - y)
+    track[YAW_RATE] = min(max(track[YAW_RATE] + rate_gain * turned, -MAX_YAW_RATE), MAX_YAW_RATE)
 
 
-def first_position_cov(distances: FloatArray, labels: IntArray, motion: Motion) -> FloatArray:
-    """(N, 3) covariance of position and velocity of objects seen once."""
-    return np.stack([position_noise(distances) ** 2, np.zeros(len(labels)), motion.speed_spread[labels] ** 2], axis=1)
-
-
-def first_yaw_cov(distances: FloatArray) -> FloatArray:
-    """(N, 3) covariance of yaw and yaw rate of objects seen once."""
-    n = len(distances)
-    return np.stack([yaw_noise(distances) ** 2, np.zeros(n), np.full(n, YAW_RATE_SPREAD**2)], axis=1)
-
-
-def _rotated(vectors: FloatArray, angles: FloatArray) -> FloatArray:
-    """(N, 2) vectors turned by (N,) angles."""
-    cos, sin = np.cos(angles), np.sin(angles)
-    return np.stack([cos * vectors[:, 0] - sin * vectors[:, 1], sin * vectors[:, 0] + cos * vectors[:, 1]], axis=1)
-
-
-def _predicted_cov(cov: FloatArray, elapsed_s: float, acceleration: FloatArray) -> FloatArray:
-    """(N, 3) covariance of value and rate a while later, under white accelerations of that deviation."""
-    value, both, rate = cov.T
-    t, power = elapsed_s, acceleration**2
-    return np.stack(
-        [
-            value + 2 * t * both + t * t * rate + power * t**4 / 4,
-            both + t * rate + power * t**3 / 2,
-            rate + power * t * t,
-        ],
-        axis=1,
-    )
-
-
-def _gains(cov: FloatArray, noise: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Kalman gains (N,) of value and rate for a measured value, and (N, 3) the covariance after it."""
-    value, both, rate = cov.T
-    gain, rate_gain = value / (value + noise), both / (value + noise)
-    return gain, rate_gain, np.stack([(1 - gain) * value, (1 - gain) * both, rate - rate_gain * both], axis=1)
+@kernel
+def begin(track, box, distance, speed_spread):  # type: ignore[no-untyped-def]
+    """Position, velocity and yaw of a track that begins with a box, and their covariances (numba); see `measure`."""
+    track[POSITION_X], track[POSITION_Y] = box[0], box[1]
+    track[VELOCITY_X] = track[VELOCITY_Y] = track[YAW_RATE] = 0.0
+    noise = POSITION_NOISE + POSITION_NOISE_BY_DISTANCE * distance
+    track[COV], track[COV_BOTH], track[COV_RATE] = noise * noise, 0.0, speed_spread * speed_spread
+    track[HEADING] = box[6]
+    noise = yaw_noise(distance)
+    track[YAW_COV], track[YAW_COV_BOTH], track[YAW_COV_RATE] = noise * noise, 0.0, YAW_RATE_SPREAD * YAW_RATE_SPREAD

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lcf3d.geometry.boxes import box_corners, points_in_boxes
 from lcf3d.geometry.camera import depths_of, project_boxes
-from lcf3d.geometry.iou import image_area, image_iou
+from lcf3d.geometry.iou import image_iou
+from lcf3d.kernels import kernel
 from lcf3d.provenance import FusedDetections
 from lcf3d.structures import BoolArray, Camera, FloatArray, IntArray
 
@@ -21,47 +23,82 @@ CAMERA_IOU = 0.4
 MIN_BEAMS = 5
 
 
-def seen_by(boxes: FloatArray, cameras: Sequence[Camera]) -> BoolArray:
-    """(N,) whether any camera looks at each of (N, 7) boxes in the LiDAR frame; all of them where there is none."""
-    if not cameras:
-        return np.ones(len(boxes), dtype=bool)
-    visible = np.zeros(len(boxes), dtype=bool)
-    for camera in cameras:
-        visible |= project_boxes(boxes, camera)[1]
-    return visible
+class View(NamedTuple):
+    """Boxes as one camera sees them: (N, 4) pixel boxes and (N,) whether it sees them at all."""
+
+    camera: Camera
+    pixels: FloatArray
+    visible: BoolArray
 
 
-def hidden_share(boxes: FloatArray, others: FloatArray, cameras: Sequence[Camera]) -> FloatArray:
+def views_of(boxes: FloatArray, cameras: Sequence[Camera]) -> list[View]:
+    """(N, 7) boxes in the LiDAR frame as each camera sees them."""
+    return [View(camera, *project_boxes(boxes, camera)) for camera in cameras]
+
+
+def seen_by(views: Sequence[View], n: int) -> BoolArray:
+    """(N,) whether any camera looks at each of the ``n`` boxes; all of them where there is no camera."""
+    if len(views) == 1:
+        return views[0].visible
+    seen = np.full(n, not views)
+    for view in views:
+        seen |= view.visible
+    return seen
+
+
+def hidden_share(boxes: FloatArray, others: FloatArray, views: Sequence[View]) -> FloatArray:
     """(N,) the largest share of each box's projection that one nearer box of ``others`` (M, 7) covers, 0 to 1.
 
     Where several cameras look at a box, the one that sees most of it counts.
+
+    Args:
+        boxes: (N, 7) in the LiDAR frame.
+        others: (M, 7) that may hide them.
+        views: of the ``boxes``.
     """
     least = np.full(len(boxes), np.inf)
-    for camera in cameras:
-        own, visible = project_boxes(boxes, camera)
+    for camera, pixels, visible in views:
         theirs, _ = project_boxes(others, camera)
-        sides = np.minimum(own[:, None, 2:], theirs[None, :, 2:]) - np.maximum(own[:, None, :2], theirs[None, :, :2])
-        shared = np.maximum(sides, 0).prod(axis=2) / np.maximum(image_area(own), 1e-9)[:, None]
-        nearer = depths_of(others, camera)[None] < depths_of(boxes, camera)[:, None] - BEHIND
-        share = np.where(nearer, shared, 0.0).max(axis=1, initial=0.0)
-        least = np.where(visible, np.minimum(least, share), least)
+        _cover(pixels, visible, depths_of(boxes, camera) - BEHIND, theirs, depths_of(others, camera), least)
     return np.where(np.isfinite(least), least, 0.0)
 
 
-def free_camera_scores(
-    boxes: FloatArray, labels: IntArray, fused: FusedDetections, cameras: Sequence[Camera]
-) -> FloatArray:
-    """(N,) best score of a 2D detection of the box's class on each box that led to no output, 0 without one."""
-    best = np.zeros(len(boxes))
-    if not len(boxes):
+@kernel
+def _cover(own, visible, limits, theirs, depths, least):  # type: ignore[no-untyped-def]
+    """Lower ``least`` (N,) to the share that one of ``theirs`` (M, 4), nearer than ``limits`` (N,), covers most."""
+    for i in range(len(own)):
+        if not visible[i]:
+            continue
+        area = max((own[i, 2] - own[i, 0]) * (own[i, 3] - own[i, 1]), 1e-9)
+        most = 0.0
+        for j in range(len(theirs)):
+            if depths[j] < limits[i]:
+                width = min(own[i, 2], theirs[j, 2]) - max(own[i, 0], theirs[j, 0])
+                height = min(own[i, 3], theirs[j, 3]) - max(own[i, 1], theirs[j, 1])
+                if width > 0 and height > 0:
+                    most = max(most, width * height / area)
+        least[i] = min(least[i], most)
+
+
+def free_camera_scores(labels: IntArray, fused: FusedDetections, views: Sequence[View]) -> FloatArray:
+    """(N,) best score of a 2D detection of the box's class on each box that led to no output, 0 without one.
+
+    Args:
+        labels: (N,) of the boxes.
+        fused: whose 2D detections.
+        views: of the boxes.
+    """
+    best = np.zeros(len(labels))
+    by_name = {view.camera.name: view for view in views}
+    free = fused.camera.output < 0
+    if not len(labels) or not free.any():
         return best
-    by_name = {camera.name: camera for camera in cameras}
     for c, (name, found) in enumerate(zip(fused.camera_names, fused.camera_inputs, strict=True)):
-        rows = np.flatnonzero((fused.camera.camera == c) & (fused.camera.output < 0))
+        rows = np.flatnonzero((fused.camera.camera == c) & free)
         if name not in by_name or not len(rows):
             continue
         found = found[fused.camera.detection[rows]].with_classes(fused.detections.class_names)
-        projected, visible = project_boxes(boxes, by_name[name])
+        _, projected, visible = by_name[name]
         shows = (image_iou(projected, found.boxes) > CAMERA_IOU) & (labels[:, None] == found.labels[None])
         scores = np.where(shows & visible[:, None], found.scores[None], 0.0)
         best = np.maximum(best, scores.max(axis=1, initial=0.0))

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from lcf3d.geometry.boxes import HEIGHT, LENGTH, WIDTH, YAW, Z
+from lcf3d.fusion.memory_state import BOTTOM, SIZE, SIZE_WEIGHT
+from lcf3d.kernels import kernel
 from lcf3d.structures import FloatArray
 
 # the past counts at most so many times what the present does in a size
@@ -20,45 +21,61 @@ BOTTOM_UNIT_S = 0.1
 POSITION_SHARE = 0.5
 
 
-def averaged_sizes(
-    sizes: FloatArray, size_weights: FloatArray, measured: FloatArray, log_odds: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """(N, 3) sizes of tracks with those measured now, and (N,) how much they then count.
+def size_weight(log_odds: FloatArray) -> FloatArray:
+    """(N,) how much measured sizes count, by the detections' log-odds; sure ones count more."""
+    return np.exp(np.minimum(np.maximum(log_odds, -6.0), 6.0) / 2)
+
+
+def bottom_share(unseen_s: FloatArray) -> FloatArray:
+    """(N,) share of the track in the height of the bottom; a track unseen for long counts less."""
+    return np.asarray(BOTTOM_SHARE ** np.maximum(unseen_s / BOTTOM_UNIT_S, 1.0))
+
+
+@kernel
+def reshape(track, box, weight, bottom_share):  # type: ignore[no-untyped-def]
+    """Average a track's sizes with those of a measured box, and steady its bottom (numba).
 
     Args:
-        sizes: (N, 3) of the tracks.
-        size_weights: (N,) how much they count.
-        measured: (N, 3) now.
-        log_odds: (N,) of the detections measured; sure ones count more.
+        track: (21,) row of `Tracks.values`; changed in place.
+        box: (7,) measured, upright as the world is.
+        weight: `size_weight` of the box.
+        bottom_share: see there.
     """
-    present = size_weight(log_odds)
-    past = np.minimum(size_weights, MAX_PAST * present)
-    total = past + present
-    return (sizes * past[:, None] + measured * present[:, None]) / total[:, None], total
+    past = min(track[SIZE_WEIGHT], MAX_PAST * weight)
+    total = past + weight
+    for k in range(3):
+        track[SIZE + k] = (track[SIZE + k] * past + box[3 + k] * weight) / total
+    track[SIZE_WEIGHT] = total
+    bottom = box[2] - box[5] / 2
+    track[BOTTOM] = bottom + bottom_share * (track[BOTTOM] - bottom)
 
 
-def size_weight(log_odds: FloatArray) -> FloatArray:
-    """(N,) how much measured sizes count, by the detections' log-odds."""
-    return np.exp(np.clip(log_odds, -6.0, 6.0) / 2)
+@kernel
+def refine(boxes, match, rigid, tracked, refined):  # type: ignore[no-untyped-def]
+    """Fill ``refined`` (N, 7) with detections made better by their tracks (numba).
 
+    Sizes and height are the track's; the side facing the sensor stays, then the position is drawn to the track's.
 
-def steadied_bottoms(bottoms: FloatArray, measured: FloatArray, elapsed_s: FloatArray) -> FloatArray:
-    """(N,) heights of the bottom between the track's and the measured ones; a track long unseen counts less."""
-    share = BOTTOM_SHARE ** np.maximum(elapsed_s / BOTTOM_UNIT_S, 1.0)
-    return measured + share * (bottoms - measured)
-
-
-def resized(boxes: FloatArray, sizes: FloatArray) -> FloatArray:
-    """(N, 7) boxes in the LiDAR frame with (N, 3) other sizes; the bottom and the side facing the sensor stay."""
-    cos, sin = np.cos(boxes[:, YAW]), np.sin(boxes[:, YAW])
-    # the sensor seen from the box, in half lengths and widths: beyond +-1 it is in front of that face
-    ahead = np.clip(-(boxes[:, 0] * cos + boxes[:, 1] * sin) / (boxes[:, LENGTH] / 2), -1, 1)
-    aside = np.clip(-(boxes[:, 1] * cos - boxes[:, 0] * sin) / (boxes[:, WIDTH] / 2), -1, 1)
-    forward = ahead * (boxes[:, LENGTH] - sizes[:, 0]) / 2
-    left = aside * (boxes[:, WIDTH] - sizes[:, 1]) / 2
-    result = boxes.copy()
-    result[:, 0] += cos * forward - sin * left
-    result[:, 1] += sin * forward + cos * left
-    result[:, Z] += (sizes[:, 2] - boxes[:, HEIGHT]) / 2
-    result[:, LENGTH : HEIGHT + 1] = sizes
-    return result
+    Args:
+        boxes: (N, 7) measured, in the LiDAR frame.
+        match: (N,) track, or -1.
+        rigid: (N,) whether the object is; others keep their box.
+        tracked: (T, 7) boxes of the tracks in the LiDAR frame.
+        refined: (N, 7) to fill.
+    """
+    for i in range(len(boxes)):
+        refined[i] = boxes[i]
+        if match[i] < 0 or not rigid[i]:
+            continue
+        box, own = boxes[i], tracked[match[i]]
+        cos, sin = np.cos(box[6]), np.sin(box[6])
+        # the sensor seen from the box, in half lengths and widths: beyond +-1 it is in front of that face
+        ahead = -(box[0] * cos + box[1] * sin) / (box[3] / 2)
+        aside = -(box[1] * cos - box[0] * sin) / (box[4] / 2)
+        forward = min(max(ahead, -1.0), 1.0) * (box[3] - own[3]) / 2
+        left = min(max(aside, -1.0), 1.0) * (box[4] - own[4]) / 2
+        x = box[0] + (cos * forward - sin * left)
+        y = box[1] + (sin * forward + cos * left)
+        refined[i, 0] = x + POSITION_SHARE * (own[0] - box[0])
+        refined[i, 1] = y + POSITION_SHARE * (own[1] - box[1])
+        refined[i, 2:6] = own[2:6]

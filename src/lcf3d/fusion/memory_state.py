@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,93 +11,123 @@ from lcf3d.fusion.memory_config import ClassColumns, MemoryConfig
 from lcf3d.geometry.boxes import HEIGHT, LENGTH, YAW, Z
 from lcf3d.structures import Camera, FloatArray, Frame, IntArray
 
+# columns of `Tracks.numbers` and `Tracks.values`
+ID, LABEL, HITS = range(3)
+(
+    POSITION_X,
+    POSITION_Y,
+    VELOCITY_X,
+    VELOCITY_Y,
+    COV,
+    COV_BOTH,
+    COV_RATE,
+    HEADING,
+    YAW_RATE,
+    YAW_COV,
+    YAW_COV_BOTH,
+    YAW_COV_RATE,
+    BOTTOM,
+    SIZE,
+    SIZE_W,
+    SIZE_H,
+    SIZE_WEIGHT,
+    SUPPORT,
+    LAST_SUPPORT,
+    BORN,
+    SEEN,
+) = range(21)
+
 
 @dataclass(frozen=True, eq=False)
 class Tracks:
     """T tracks, one row each; lengths in metres, angles in radians, times in seconds, all in the world frame.
 
+    Two tables, so that a step is a few calls whatever the number of tracks; the columns have names of their own.
+
     Attributes:
-        ids: (T,) numbers that are never used again within a sequence.
-        labels: (T,) class.
-        positions: (T, 2) x and y of the centre.
-        velocities: (T, 2) m/s.
-        position_cov: (T, 3) of the filter along either axis: variance of position, covariance, variance of velocity.
-        yaws: (T,) heading.
-        yaw_rates: (T,) rad/s.
-        yaw_cov: (T, 3) variance of yaw, covariance, variance of yaw rate.
-        bottoms: (T,) height of the bottom face.
-        sizes: (T, 3) length, width, height.
-        size_weights: (T,) how much the past counts in ``sizes``.
-        support: (T,) what past frames say for the object, see `memory_evidence.grown_support`.
-        last_support: (T,) what the last frame said, not yet part of ``support``.
-        hits: (T,) number of frames that saw the object.
-        born: (T,) time of the first.
-        seen: (T,) time of the last.
+        numbers: (T, 3) id, never used again within a sequence; class; number of frames that saw the object.
+        values: (T, 21) in the order of the properties below.
     """
 
-    ids: IntArray
-    labels: IntArray
-    positions: FloatArray
-    velocities: FloatArray
-    position_cov: FloatArray
-    yaws: FloatArray
-    yaw_rates: FloatArray
-    yaw_cov: FloatArray
-    bottoms: FloatArray
-    sizes: FloatArray
-    size_weights: FloatArray
-    support: FloatArray
-    last_support: FloatArray
-    hits: IntArray
-    born: FloatArray
-    seen: FloatArray
+    numbers: IntArray
+    values: FloatArray
 
     @classmethod
     def empty(cls) -> Tracks:
         """No tracks."""
-        none = np.zeros(0)
-        whole = np.zeros(0, dtype=np.int64)
-        pair, triple = np.zeros((0, 2)), np.zeros((0, 3))
-        return cls(
-            whole,
-            whole,
-            pair,
-            pair,
-            triple,
-            none,
-            none,
-            triple,
-            none,
-            triple,
-            none,
-            none,
-            none,
-            whole,
-            none,
-            none,
-        )
+        return cls(np.zeros((0, 3), dtype=np.int64), np.zeros((0, 21)))
 
     def __len__(self) -> int:
-        return len(self.ids)
+        return len(self.numbers)
 
     def __getitem__(self, index: Any) -> Tracks:
         """Those selected by a slice, an integer array or a boolean mask."""
-        return Tracks(*(getattr(self, column.name)[index] for column in fields(self)))
+        return Tracks(self.numbers[index], self.values[index])
 
-    def joined(self, other: Tracks) -> Tracks:
-        """These and then the others."""
-        if not len(self) or not len(other):
-            return self if len(self) else other
-        return Tracks(*(np.concatenate([getattr(self, c.name), getattr(other, c.name)]) for c in fields(self)))
+    @property
+    def ids(self) -> IntArray:
+        """(T,) numbers that are never used again within a sequence."""
+        return self.numbers[:, ID]
 
-    def updated(self, rows: IntArray, new: Tracks) -> Tracks:
-        """These with ``rows`` replaced by those of ``new``."""
-        columns = []
-        for column in fields(self):
-            values = getattr(self, column.name).copy()
-            values[rows] = getattr(new, column.name)
-            columns.append(values)
-        return Tracks(*columns)
+    @property
+    def labels(self) -> IntArray:
+        """(T,) class."""
+        return self.numbers[:, LABEL]
+
+    @property
+    def hits(self) -> IntArray:
+        """(T,) number of frames that saw the object."""
+        return self.numbers[:, HITS]
+
+    @property
+    def positions(self) -> FloatArray:
+        """(T, 2) x and y of the centre."""
+        return self.values[:, :VELOCITY_X]
+
+    @property
+    def velocities(self) -> FloatArray:
+        """(T, 2) m/s."""
+        return self.values[:, VELOCITY_X:COV]
+
+    @property
+    def position_cov(self) -> FloatArray:
+        """(T, 3) of the filter along either axis: variance of position, covariance, variance of velocity."""
+        return self.values[:, COV:HEADING]
+
+    @property
+    def yaws(self) -> FloatArray:
+        """(T,) heading; the yaw rate and the (T, 3) covariance of both follow in ``values``."""
+        return self.values[:, HEADING]
+
+    @property
+    def bottoms(self) -> FloatArray:
+        """(T,) height of the bottom face."""
+        return self.values[:, BOTTOM]
+
+    @property
+    def sizes(self) -> FloatArray:
+        """(T, 3) length, width, height; how much the past counts in them follows in ``values``."""
+        return self.values[:, SIZE:SIZE_WEIGHT]
+
+    @property
+    def support(self) -> FloatArray:
+        """(T,) what past frames say for the object, see `memory_evidence.grown_support`."""
+        return self.values[:, SUPPORT]
+
+    @property
+    def last_support(self) -> FloatArray:
+        """(T,) what the last frame said, not yet part of ``support``."""
+        return self.values[:, LAST_SUPPORT]
+
+    @property
+    def born(self) -> FloatArray:
+        """(T,) time of the first frame that saw the object."""
+        return self.values[:, BORN]
+
+    @property
+    def seen(self) -> FloatArray:
+        """(T,) time of the last."""
+        return self.values[:, SEEN]
 
     @property
     def boxes(self) -> FloatArray:
@@ -141,6 +171,12 @@ class Memory:
     sequence: str | None
     config: MemoryConfig
     classes: ClassColumns
+
+    def fits(self, class_names: tuple[str, ...], config: MemoryConfig) -> bool:
+        """Whether a frame of these classes may join, with these settings."""
+        # most often the very same object: comparing settings field by field takes longer than most steps
+        same = self.config is config or self.config == config
+        return same and self.class_names == class_names
 
 
 class Moment(NamedTuple):

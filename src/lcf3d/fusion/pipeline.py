@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import logging
+from collections import defaultdict
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import replace
+from functools import cached_property, partial
 
 import numpy as np
 
 from lcf3d import plugins
 from lcf3d.fusion.branches import Branches, by_camera_name, prepare_branches
 from lcf3d.fusion.calibration import Calibration
-from lcf3d.fusion.cluster_evidence import ClusterEvidence, fused_scores, gather_evidence, recovered_trust
+from lcf3d.fusion.cluster_evidence import ClusterEvidence, evidence_of, fused_scores, gather_evidence, recovered_trust
 from lcf3d.fusion.clustering import Clusters, cluster_boxes
 from lcf3d.fusion.config import FusionConfig
 from lcf3d.fusion.decisions import (
@@ -23,7 +24,7 @@ from lcf3d.fusion.decisions import (
 )
 from lcf3d.fusion.localizer import Localizer
 from lcf3d.fusion.matching import Matches, View, boxes_after, confirmed_elsewhere, match_view, merge_views
-from lcf3d.fusion.recovery import Recovery, recover
+from lcf3d.fusion.recovery import NOTHING, Recovery, recover
 from lcf3d.fusion.roles import unknown_classes
 from lcf3d.fusion.warm_up import warm_up_frame
 from lcf3d.provenance import FusedDetections, Outcome, Reason
@@ -89,8 +90,8 @@ class LateCascadeFusion:
         decisions = self._decide(branches, clusters, views, matches)  # (e) semantic fusion
         recovery, notes = self._recover(frame, branches, clusters, views, matches, decisions)  # (d) detection recovery
         decisions = replace_unconfirmed(decisions, branches.lidar, recovery, self.config.duplicate_iou)
-        fused = assemble(branches, clusters, views, matches, decisions, recovery, notes)
-        return replace(fused, lidar_inputs=lidar, camera_inputs=tuple(camera[name] for name in fused.camera_names))
+        given = tuple(camera[view.name] for view in branches.cameras)
+        return assemble(branches, clusters, views, matches, decisions, recovery, notes, lidar, given)
 
     def evidence(self, frame: Frame, lidar: Detections3D, camera: Mapping[str, Detections2D]) -> ClusterEvidence:
         """The evidence for every cluster of one frame, ``box`` counted in ``lidar``: what calibration is fitted on.
@@ -120,14 +121,13 @@ class LateCascadeFusion:
         With ``views``: that some camera which looks at them can report. With ``camera``: that this camera can report.
         """
         labels = branches.lidar.labels[boxes]
-        known = np.array([self.calibration.detects(name) for name in self.config.class_names])
-        detected = np.asarray(known[labels], dtype=bool)
+        detected: BoolArray = self._detected[labels]
         if not self.reports:
             return detected
         if camera is not None:
-            return detected & self._reported(camera)[labels]
+            return detected & self._reported[camera][labels]
         judged = [
-            view.visible & self._reported(one.name)[labels] for view, one in zip(views, branches.cameras, strict=True)
+            view.visible & self._reported[one.name][labels] for view, one in zip(views, branches.cameras, strict=True)
         ]
         return detected & np.any(judged, axis=0) if judged else detected
 
@@ -137,15 +137,26 @@ class LateCascadeFusion:
             return list(views)
         labels = branches.lidar.labels[boxes]
         return [
-            view._replace(visible=view.visible & self._reported(camera.name)[labels])
+            view._replace(visible=view.visible & self._reported[camera.name][labels])
             for view, camera in zip(views, branches.cameras, strict=True)
         ]
 
-    def _reported(self, camera: str) -> BoolArray:
-        """(classes,) whether the detector of a camera can report each class."""
+    @cached_property
+    def _detected(self) -> BoolArray:
+        """(classes,) whether the camera branch detects each class at all."""
+        return np.array([self.calibration.detects(name) for name in self.config.class_names], dtype=bool)
+
+    @cached_property
+    def _reported(self) -> defaultdict[str, BoolArray]:
+        """(classes,) by camera, whether its detector can report each class; all where nothing is known."""
         names = self.config.class_names
-        reported = self.reports.get(camera, names)
-        return np.array([name in reported for name in names], dtype=bool)
+        known = {camera: np.array([n in of for n in names], dtype=bool) for camera, of in self.reports.items()}
+        return defaultdict(partial(np.ones, len(names), dtype=bool), known)
+
+    @cached_property
+    def _weights(self) -> list[FloatArray]:
+        """(9,) by class, see `Evidence.weights`."""
+        return [evidence_of(name, self.config, self.calibration).weights for name in self.config.class_names]
 
     def _decide(
         self, branches: Branches, clusters: Clusters, views: Sequence[View], matches: Matches
@@ -157,7 +168,7 @@ class LateCascadeFusion:
             weighed = gather_evidence(
                 box, branches, self._judging(branches, views, box), matches, self.config, self.calibration
             )
-            scores = fused_scores(weighed, self.config, self.calibration)
+            scores = fused_scores(weighed, self._weights)
         return decide_clusters(box, branches, matches, self.config, self._detectable(branches, box, views), scores)
 
     def _match(self, branches: Branches) -> tuple[Clusters, list[View], Matches]:
@@ -192,9 +203,9 @@ class LateCascadeFusion:
         class go first; of the others only decisive detections, which may change a label.
         """
         boxes = clusters.representative
-        judged = np.broadcast_to(self._detectable(branches, boxes, camera=camera)[:, None], (len(boxes), len(found)))
+        judged = self._detectable(branches, boxes, camera=camera)[:, None]
         if self.config.assignment != "class_first":
-            return [] if judged.all() else [judged]
+            return [] if judged.all() else [np.repeat(judged, len(found), axis=1)]
         equal = branches.lidar.labels[boxes][:, None] == found.labels[None]
         decisive = found.scores > self.config.decisive_score
         return [equal & judged, judged & decisive[None]]
@@ -212,7 +223,9 @@ class LateCascadeFusion:
         config = self.config
         candidates = []
         for c, (view, found) in enumerate(zip(views, branches.camera, strict=True)):
-            free = np.setdiff1d(np.arange(len(found)), view.match)
+            unmatched = np.ones(len(found), dtype=bool)
+            unmatched[view.match[view.match >= 0]] = False
+            free = unmatched.nonzero()[0]
             elsewhere = confirmed_elsewhere(views, matches, clusters, found.boxes[free], c, config.elsewhere_iou)
             self._mark(branches, c, free[elsewhere], Reason.SEEN_ELSEWHERE)
             candidates.append(free[~elsewhere])
@@ -222,19 +235,16 @@ class LateCascadeFusion:
             points = frame.points
             if points is None:
                 notes.append("there is no scan: unmatched camera detections could not be recovered")
-        pairs = None
         if points is None:
             reason = Reason.NO_SCAN if config.recovery else Reason.NO_RECOVERY
             for c, free in enumerate(candidates):
                 self._mark(branches, c, free[branches.camera[c].scores[free] > config.decisive_score], reason)
-            candidates = [free[:0] for free in candidates]
-            points = np.zeros((0, 4), np.float32)
-        else:
-            # one bad value spoils the sum, which takes a fifth of the time of a look at every value
-            bad = 0 if np.isfinite(points.sum()) else int((~np.isfinite(points[:, :3]).all(axis=1)).sum())
-            if bad:
-                notes.append(f"{bad} points of the scan are not finite and were not used")
-            candidates, pairs = self._choose_candidates(branches, candidates)
+            return NOTHING, notes
+        # one bad value spoils the sum, which takes a fifth of the time of a look at every value
+        bad = 0 if np.isfinite(points.sum()) else int((~np.isfinite(points[:, :3]).all(axis=1)).sum())
+        if bad:
+            notes.append(f"{bad} points of the scan are not finite and were not used")
+        candidates, pairs = self._choose_candidates(branches, candidates)
         recovery = recover(
             points,
             branches.cameras,

@@ -52,6 +52,16 @@ class Recovery(NamedTuple):
         return np.flatnonzero(self.reason == Reason.LOCALIZED)
 
 
+NOTHING = Recovery(
+    *(np.zeros(0, np.int64),) * 3,
+    np.zeros((0, 7)),
+    *(np.zeros(0),) * 2,
+    *(np.zeros(0, np.int64),) * 3,
+    *(np.zeros(0),) * 2,
+)
+"""Where there is no candidate."""
+
+
 def recover(
     points: NDArray[np.float32],
     cameras: Sequence[Camera],
@@ -90,6 +100,8 @@ def recover(
     Raises:
         DetectorError: the localizer's answer does not have one box a proposal.
     """
+    if not any(len(chosen) for chosen in candidates):
+        return NOTHING
     table = _candidate_table(detections, candidates, pairs)
     proposals = extract_frustums(
         points,

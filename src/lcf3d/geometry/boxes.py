@@ -6,9 +6,12 @@ yaw counter-clockwise about +z from +x, in [-pi, pi).
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
+from lcf3d.kernels import kernel
 from lcf3d.structures import FloatArray
 
 X, Y, Z, LENGTH, WIDTH, HEIGHT, YAW = range(7)
@@ -42,13 +45,23 @@ def wrap_angle(angle: FloatArray) -> FloatArray:
 
 def box_corners(boxes: FloatArray) -> FloatArray:
     """(N, 8, 3) corners of (N, 7) canonical boxes, in the order drawn at `CORNER_SIGNS`."""
-    local = CORNER_SIGNS[None] * (boxes[:, None, LENGTH : HEIGHT + 1] / 2)
-    cos, sin = np.cos(boxes[:, YAW])[:, None], np.sin(boxes[:, YAW])[:, None]
     corners = np.empty((len(boxes), 8, 3))
-    corners[..., 0] = boxes[:, None, X] + cos * local[..., 0] - sin * local[..., 1]
-    corners[..., 1] = boxes[:, None, Y] + sin * local[..., 0] + cos * local[..., 1]
-    corners[..., 2] = boxes[:, None, Z] + local[..., 2]
+    # a copy in C order, so that one compiled version serves all
+    _fill_corners(np.array(boxes, dtype=np.float64, order="C"), corners)
     return corners
+
+
+@kernel
+def _fill_corners(boxes, corners):  # type: ignore[no-untyped-def]
+    """Fill ``corners`` (N, 8, 3)."""
+    for n in range(len(boxes)):
+        cos, sin = np.cos(boxes[n, 6]), np.sin(boxes[n, 6])
+        for c in range(8):
+            ahead = CORNER_SIGNS[c, 0] * (boxes[n, 3] / 2)
+            aside = CORNER_SIGNS[c, 1] * (boxes[n, 4] / 2)
+            corners[n, c, 0] = boxes[n, 0] + cos * ahead - sin * aside
+            corners[n, c, 1] = boxes[n, 1] + sin * ahead + cos * aside
+            corners[n, c, 2] = boxes[n, 2] + CORNER_SIGNS[c, 2] * (boxes[n, 5] / 2)
 
 
 def bev_corners(boxes: FloatArray) -> FloatArray:
@@ -61,11 +74,24 @@ def transform_boxes(boxes: FloatArray, target_from_source: FloatArray) -> FloatA
 
     Exact for transforms that keep the vertical axis.
     """
-    result = np.array(boxes, dtype=np.float64)
-    result[:, :3] = boxes[:, :3] @ target_from_source[:3, :3].T + target_from_source[:3, 3]
-    heading = np.stack([np.cos(boxes[:, YAW]), np.sin(boxes[:, YAW])], axis=1) @ target_from_source[:2, :2].T
-    result[:, YAW] = wrap_angle(np.arctan2(heading[:, 1], heading[:, 0]))
+    # a copy in C order, so that one compiled version serves all
+    result = np.array(boxes, dtype=np.float64, order="C")
+    _transform(result, np.array(target_from_source, dtype=np.float64, order="C"))
     return result
+
+
+@kernel
+def _transform(boxes, transform):  # type: ignore[no-untyped-def]
+    """Move ``boxes`` (N, 7) in place, each by itself: no digit of a box depends on the others."""
+    for n in range(len(boxes)):
+        x, y, z = boxes[n, 0], boxes[n, 1], boxes[n, 2]
+        for r in range(3):
+            boxes[n, r] = transform[r, 0] * x + transform[r, 1] * y + transform[r, 2] * z + transform[r, 3]
+        cos, sin = np.cos(boxes[n, 6]), np.sin(boxes[n, 6])
+        ahead, aside = transform[0, 0] * cos + transform[0, 1] * sin, transform[1, 0] * cos + transform[1, 1] * sin
+        yaw = math.atan2(aside, ahead)
+        # -pi stands for pi
+        boxes[n, 6] = -math.pi if yaw >= math.pi else yaw
 
 
 def lidar_from_kitti(

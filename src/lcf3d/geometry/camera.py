@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lcf3d.errors import ConfigError
-from lcf3d.geometry.boxes import EDGES, box_corners
+from lcf3d.geometry.boxes import EDGES, YAW, box_corners
 from lcf3d.geometry.lens import (
     NEAR,
     bound_through_lens,
@@ -37,22 +37,29 @@ def project_points(points: NDArray[np.floating], camera: Camera) -> tuple[FloatA
 
 
 @kernel
-def _bound_projections(corners, edges, projection, near, bounds):  # type: ignore[no-untyped-def]
-    """Fill ``bounds`` (N, 4) with the extent of each box's projection in front of the near plane, inf where none."""
+def _project_boxes(boxes, cos, sin, edges, projection, limits):  # type: ignore[no-untyped-def]
+    """Image boxes (N, 4) of the parts in front of the near plane, clipped to (0, 0, *limits), and (N,) visibility.
+
+    ``cos`` and ``sin`` (N,) are those of the boxes' yaws; corners are in the order of `box_corners`.
+    """
+    projected, visible = np.zeros((len(boxes), 4)), np.zeros(len(boxes), np.bool_)
     homogeneous = np.empty((8, 3))
-    for n in range(len(corners)):
+    for n in range(len(boxes)):
         x1 = y1 = np.inf
         x2 = y2 = -np.inf
         behind = 0
         for c in range(8):
+            length = boxes[n, 3] / 2 if c % 4 < 2 else -(boxes[n, 3] / 2)
+            width = boxes[n, 4] / 2 if c % 4 == 0 or c % 4 == 3 else -(boxes[n, 4] / 2)
+            height = boxes[n, 5] / 2 if c >= 4 else -(boxes[n, 5] / 2)
+            x = boxes[n, 0] + cos[n] * length - sin[n] * width
+            y = boxes[n, 1] + sin[n] * length + cos[n] * width
+            z = boxes[n, 2] + height
             for r in range(3):
                 homogeneous[c, r] = (
-                    projection[r, 0] * corners[n, c, 0]
-                    + projection[r, 1] * corners[n, c, 1]
-                    + projection[r, 2] * corners[n, c, 2]
-                    + projection[r, 3]
+                    projection[r, 0] * x + projection[r, 1] * y + projection[r, 2] * z + projection[r, 3]
                 )
-            if homogeneous[c, 2] >= near:
+            if homogeneous[c, 2] >= NEAR:
                 u, v = homogeneous[c, 0] / homogeneous[c, 2], homogeneous[c, 1] / homogeneous[c, 2]
                 x1, x2, y1, y2 = min(x1, u), max(x2, u), min(y1, v), max(y2, v)
             else:
@@ -60,13 +67,18 @@ def _bound_projections(corners, edges, projection, near, bounds):  # type: ignor
         if 0 < behind < 8:
             for e in range(len(edges)):
                 a, b = edges[e, 0], edges[e, 1]
-                da, db = homogeneous[a, 2] - near, homogeneous[b, 2] - near
+                da, db = homogeneous[a, 2] - NEAR, homogeneous[b, 2] - NEAR
                 if (da >= 0) != (db >= 0):
                     t = da / (da - db)
-                    u = (homogeneous[a, 0] + t * (homogeneous[b, 0] - homogeneous[a, 0])) / near
-                    v = (homogeneous[a, 1] + t * (homogeneous[b, 1] - homogeneous[a, 1])) / near
+                    u = (homogeneous[a, 0] + t * (homogeneous[b, 0] - homogeneous[a, 0])) / NEAR
+                    v = (homogeneous[a, 1] + t * (homogeneous[b, 1] - homogeneous[a, 1])) / NEAR
                     x1, x2, y1, y2 = min(x1, u), max(x2, u), min(y1, v), max(y2, v)
-        bounds[n, 0], bounds[n, 1], bounds[n, 2], bounds[n, 3] = x1, y1, x2, y2
+        x1, x2 = min(max(x1, 0.0), limits[0]), min(max(x2, 0.0), limits[0])
+        y1, y2 = min(max(y1, 0.0), limits[1]), min(max(y2, 0.0), limits[1])
+        if x2 > x1 and y2 > y1:
+            visible[n] = True
+            projected[n, 0], projected[n, 1], projected[n, 2], projected[n, 3] = x1, y1, x2, y2
+    return projected, visible
 
 
 def project_boxes(boxes: FloatArray, camera: Camera) -> tuple[FloatArray, BoolArray]:
@@ -82,11 +94,19 @@ def project_boxes(boxes: FloatArray, camera: Camera) -> tuple[FloatArray, BoolAr
     Returns:
         (N, 4) pixel boxes clipped to the image, zeros where not visible; and (N,) whether they have positive area.
     """
-    bounds = np.empty((len(boxes), 4))
     if camera.distortion is None:
-        _bound_projections(box_corners(boxes), EDGES, np.array(camera.pixels_from_lidar), NEAR, bounds)
-    else:
-        bound_through_lens(boxes, box_corners(boxes), EDGES, lens_numbers(camera), bounds)
+        # copies, so that one compiled version serves arrays that are read-only and others
+        own, matrix, limits = (
+            np.array(boxes, order="C"),
+            np.array(camera.pixels_from_lidar),
+            (camera.width, camera.height),
+        )
+        projected: tuple[FloatArray, BoolArray] = _project_boxes(
+            own, np.cos(own[:, YAW]), np.sin(own[:, YAW]), EDGES, matrix, limits
+        )
+        return projected
+    bounds = np.empty((len(boxes), 4))
+    bound_through_lens(boxes, box_corners(boxes), EDGES, lens_numbers(camera), bounds)
     clipped = np.empty_like(bounds)
     np.clip(bounds[:, 0::2], 0, camera.width, out=clipped[:, 0::2])
     np.clip(bounds[:, 1::2], 0, camera.height, out=clipped[:, 1::2])

@@ -88,6 +88,10 @@ def turned_intersection(ax, ay, a_length, a_width, cos_a, sin_a, bx, by, b_lengt
 @kernel
 def bev_intersection(ax, ay, a_length, a_width, a_yaw, bx, by, b_length, b_width, b_yaw):  # type: ignore[no-untyped-def]
     """Area that two rotated rectangles share (scalars; numba)."""
+    reach = 0.5 * (math.hypot(a_length, a_width) + math.hypot(b_length, b_width))
+    # most pairs of a frame are far apart: no cosines for them
+    if (bx - ax) * (bx - ax) + (by - ay) * (by - ay) >= reach * reach:
+        return 0.0
     return turned_intersection(
         ax,
         ay,

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from lcf3d.kernels import kernel
 from lcf3d.structures import FloatArray
 
 
@@ -93,12 +94,31 @@ def transform_points(points: FloatArray, target_from_source: FloatArray) -> Floa
 def interpolated(first: FloatArray, second: FloatArray, share: float) -> FloatArray:
     """The (4, 4) pose that lies ``share`` of the way between two; beyond 1 the motion is carried on.
 
-    The normalised line between the quaternions is the great circle to a hundredth of a degree for small turns.
+    The turn between them goes on evenly about its axis; the way is a straight line.
     """
-    q = quaternions_from_matrices(np.stack([first[:3, :3], second[:3, :3]]))
-    if q[0] @ q[1] < 0:
-        q[1] = -q[1]
-    turned = (1 - share) * q[0] + share * q[1]
-    moved = (1 - share) * first[:3, 3] + share * second[:3, 3]
-    pose: FloatArray = rigid_transforms(turned[None], moved[None])[0]
+    pose = np.eye(4)
+    _fill_between(np.asarray(first, dtype=np.float64), np.asarray(second, dtype=np.float64), float(share), pose)
     return pose
+
+
+@kernel
+def _fill_between(first, second, share, pose):  # type: ignore[no-untyped-def]
+    """Fill (4, 4) ``pose``: `interpolated`."""
+    turn = np.empty((3, 3))
+    for i in range(3):
+        pose[i, 3] = (1 - share) * first[i, 3] + share * second[i, 3]
+        for j in range(3):
+            turn[i, j] = first[0, i] * second[0, j] + first[1, i] * second[1, j] + first[2, i] * second[2, j]
+    x, y, z = turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]
+    double_sine = np.sqrt(x * x + y * y + z * z)
+    if double_sine > 1e-12:
+        x, y, z = x / double_sine, y / double_sine, z / double_sine
+    angle = share * np.arctan2(double_sine, turn[0, 0] + turn[1, 1] + turn[2, 2] - 1)
+    # Rodrigues' formula
+    sine, rest = np.sin(angle), 1 - np.cos(angle)
+    turn[0] = 1 - rest * (y * y + z * z), rest * x * y - sine * z, rest * x * z + sine * y
+    turn[1] = rest * x * y + sine * z, 1 - rest * (x * x + z * z), rest * y * z - sine * x
+    turn[2] = rest * x * z - sine * y, rest * y * z + sine * x, 1 - rest * (x * x + y * y)
+    for i in range(3):
+        for j in range(3):
+            pose[i, j] = first[i, 0] * turn[0, j] + first[i, 1] * turn[1, j] + first[i, 2] * turn[2, j]

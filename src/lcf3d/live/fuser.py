@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from time import perf_counter
@@ -32,6 +33,9 @@ from lcf3d.live.warming import warm_up
 from lcf3d.live.workers import Worker, attempt
 from lcf3d.provenance import FusedDetections
 from lcf3d.structures import Camera, Detections2D, Detections3D, FloatArray, Frame
+
+# no moment waits longer than this for the watch (seconds)
+LONGEST_OFFSET = 0.5
 
 
 @dataclass(frozen=True)
@@ -125,6 +129,7 @@ class Fuser:
         self._detect_ms: dict[tuple[str, float], float] = {}
         self._results: list[LiveResult] = []
         self._watched = -np.inf
+        self._unwatched: deque[tuple[Frame, Detections3D, dict[str, Detections2D]]] = deque()
         self._lock = threading.RLock()
 
     def push(self, message: Message) -> list[LiveResult]:
@@ -277,6 +282,7 @@ class Fuser:
         newest = self._poses.newest if self.settings.sync.poses else np.inf
         for group in self._sync.ready(frozenset(self._models), newest, everything):
             self._fuse(group)
+        self._show_to_watch(everything)
         if len(self._detect_ms) > 64:
             for key in list(self._detect_ms)[:-64]:
                 del self._detect_ms[key]
@@ -314,7 +320,20 @@ class Fuser:
         self.health.fused(frame, result, found, latency, group.points)
         if self.watch is not None and not 0 <= group.time - self._watched < 0.9 * self.settings.watch_period:
             self._watched = group.time
-            self._observe(nominal, group.lidar, found)
+            self._unwatched.append((nominal, group.lidar, found))
+
+    def _show_to_watch(self, everything: bool) -> None:
+        """Show the watch what waits for it: for a time offset, once the car's motion up to the true moment is known."""
+        while self._unwatched:
+            frame = self._unwatched[0][0]
+            assert self.watch is not None
+            assert frame.timestamp is not None
+            if self.watch.settings.time and len(self._poses) and not everything:
+                ahead = max([0.0, *(self.watch.estimate(camera.name).time_offset for camera in frame.cameras)])
+                newer = self._watched - frame.timestamp
+                if self._poses.newest < frame.timestamp + ahead and newer <= LONGEST_OFFSET:
+                    return
+            self._observe(*self._unwatched.popleft())
 
     def _observe(self, nominal: Frame, lidar: Detections3D, found: dict[str, Detections2D]) -> None:
         """Show a moment to the watch: in real time in a thread of its own, where it skips what it has no time for."""
@@ -360,7 +379,7 @@ class Fuser:
             timestamp=group.time,
             world_from_lidar=self._poses.at(group.time),
         )
-        return frame, frame.with_cameras(nominal)
+        return frame, frame.with_cameras(nominal) if corrected else frame
 
     def _moved(self, camera: Camera, time: float, shift: float) -> Camera:
         """A camera as it stood ``shift`` seconds after a scan, seen from the LiDAR at the scan."""

@@ -73,6 +73,7 @@ class Health:
         self.missing_sectors: list[tuple[int, int]] = []
         self._streams: dict[str, Stream] = {}
         self._shares: dict[str, deque[tuple[int, int]]] = {}
+        self._blinded: set[str] = set()
         self._absent: Counter[str] = Counter()
         self._sectors: deque[NDArray[np.int64]] = deque(maxlen=RECENT)
         self._told: set[str] = set()
@@ -131,6 +132,7 @@ class Health:
             confirmed = int((overlap > 0.3).any(axis=1).sum()) if overlap.size else 0
             shares = self._shares.setdefault(camera.name, deque(maxlen=USUAL))
             shares.append((int(tall.sum()), confirmed))
+            self._judge_sight(camera.name)
         if points is not None:
             self._look_at_sectors(points)
 
@@ -142,15 +144,18 @@ class Health:
 
     def blinded(self) -> frozenset[str]:
         """Cameras that confirm far fewer LiDAR boxes than they used to."""
-        names = []
-        for camera, rows in self._shares.items():
-            if len(rows) < 2 * NOW:
-                continue
-            now, seen = self.share(camera, NOW)
-            usual = max(_share(list(rows)[:-NOW]), 0.0)
-            if seen >= FEWEST_BOXES and usual > 0.4 and now < BLINDED * usual:
-                names.append(camera)
-        return frozenset(names)
+        return frozenset(self._blinded)
+
+    def _judge_sight(self, camera: str) -> None:
+        """Whether a camera is blinded from now on."""
+        rows = list(self._shares[camera])
+        now, usual = rows[-NOW:], rows[:-NOW]
+        seen = sum(row[0] for row in now)
+        usually = _share(usual)
+        if len(usual) >= NOW and seen >= FEWEST_BOXES and usually > 0.4 and _share(now) < BLINDED * usually:
+            self._blinded.add(camera)
+        else:
+            self._blinded.discard(camera)
 
     def frozen(self, camera: str) -> bool:
         """Whether a camera has sent the same again and again."""

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
-from bisect import bisect_left, insort
+from bisect import bisect_left, bisect_right, insort
 
 import numpy as np
 
+from lcf3d.fusion.alignment import STANDING
 from lcf3d.geometry.rotation import interpolated, invert_rigid
 from lcf3d.structures import Detections3D, FloatArray
 
 # beyond the newest pose the last motion is carried on for so long (seconds)
 CARRY_ON = 0.25
-# what a detector believes to move more slowly than this is taken to stand (m/s)
-STANDING = 1.5
+# the last motion is that of so long (seconds): poses that follow each other closely have too much noise to tell
+BASE = 0.1
 # poses older than this before the newest are forgotten
 KEPT = 5.0
+# answers that are kept between two poses
+MOST_ANSWERS = 256
 
 
 class PoseBuffer:
@@ -23,6 +26,8 @@ class PoseBuffer:
     def __init__(self) -> None:
         self._times: list[float] = []
         self._poses: dict[float, FloatArray] = {}
+        # what was asked for since the newest pose: every camera of a moment asks for the scan's
+        self._answers: dict[float, FloatArray | None] = {}
 
     def __len__(self) -> int:
         return len(self._times)
@@ -37,11 +42,19 @@ class PoseBuffer:
         if time not in self._poses:
             insort(self._times, time)
             self._poses[time] = np.asarray(world_from_lidar, dtype=np.float64)
+            self._answers.clear()
         while self._times[0] < self._times[-1] - KEPT:
             del self._poses[self._times.pop(0)]
 
     def at(self, time: float) -> FloatArray | None:
         """(4, 4) ``world_from_lidar`` at a moment; None where no poses are near enough."""
+        if time not in self._answers:
+            if len(self._answers) >= MOST_ANSWERS:
+                self._answers.clear()
+            self._answers[time] = self._at(time)
+        return self._answers[time]
+
+    def _at(self, time: float) -> FloatArray | None:
         if not self._times:
             return None
         i = bisect_left(self._times, time)
@@ -49,8 +62,12 @@ class PoseBuffer:
             return self._poses[time]
         if len(self._times) < 2 or time < self._times[0] or time > self._times[-1] + CARRY_ON:
             return None
-        i = min(max(i, 1), len(self._times) - 1)
-        before, after = self._times[i - 1], self._times[i]
+        if i == len(self._times):
+            i -= 1
+            before = self._times[max(bisect_right(self._times, self._times[i] - BASE) - 1, 0)]
+        else:
+            before = self._times[i - 1]
+        after = self._times[i]
         return interpolated(self._poses[before], self._poses[after], (time - before) / (after - before))
 
     def motion(self, earlier: float, later: float) -> FloatArray | None:

@@ -40,8 +40,8 @@ def _shipped(dataset: str, threads: int) -> Localizer:
 def load_localizer(text: str) -> Localizer:
     """The localizer that a string names, see `lcf3d.plugins`.
 
-    ``geometric`` (the default), ``network`` (the shipped ones), ``onnx:FILE`` (of ``lcf3d train localizer``),
-    ``frustum-pointnet:FILE`` (a checkpoint of the LCF3D authors' form).
+    ``geometric`` (the default), ``network`` (the shipped ones), ``combined`` (both), ``onnx:FILE`` (of ``lcf3d train
+    localizer``), ``frustum-pointnet:FILE`` (a checkpoint of the LCF3D authors' form).
 
     Raises:
         ConfigError: it names none.

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from lcf3d.errors import DetectorError
+from lcf3d.remote.places import fetched
 
 
 def open_session(path: Path, threads: int, what: str) -> Any:
@@ -29,9 +30,37 @@ def open_session(path: Path, threads: int, what: str) -> Any:
     # waiting threads that spin doubled the time where other processes compute too
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     try:
-        return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+        session = onnxruntime.InferenceSession(str(fetched(path)), options, providers=["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime's exceptions share no base class
         raise DetectorError(f"{path} cannot be read as an ONNX file: {first_line(error)}") from error
+    return Session(session, path, threads, what)
+
+
+class Session:
+    """An onnxruntime session that can be sent to another process, where it is opened anew."""
+
+    def __init__(self, session: Any, path: Path, threads: int, what: str) -> None:
+        self._session, self._opened_with = session, (path, threads, what)
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        return getattr(self._session, name)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return open_session, self._opened_with
+
+
+def read_metadata(session: Any, path: Path | str) -> dict[str, str]:
+    """The texts that a network carries by their names.
+
+    Raises:
+        DetectorError: they are no texts: the file is damaged.
+    """
+    try:
+        return dict(session.get_modelmeta().custom_metadata_map)
+    except UnicodeDecodeError as error:
+        raise DetectorError(f"{path}: its metadata is damaged ({error.reason}); export it again") from None
 
 
 def first_line(error: Exception) -> str:

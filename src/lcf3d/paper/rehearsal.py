@@ -10,9 +10,9 @@ from lcf3d.detectors.published import find_model
 from lcf3d.files import atomic_path
 from lcf3d.networks.torch import torch
 
-# the camera networks that have no readable form here are rehearsed as one that finds the same classes
+# the camera networks are rehearsed as the smallest one of their kind that finds the same classes
 _CAMERAS = {
-    "fasterrcnn-r101-kitti": (101, "kitti", False),
+    "fasterrcnn-r101-kitti": (50, "kitti", False),
     "fasterrcnn-r50-nuscenes": (50, "nuscenes", False),
     "ddq-detr-nuscenes": (50, "nuscenes", False),
     "detectors-nuimages": (50, "nuscenes", True),

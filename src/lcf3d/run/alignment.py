@@ -71,6 +71,8 @@ def _reports(sightings: list[Sighting]) -> list[CameraReport]:
 
 def aligned_frame(frame: Frame, alignment: Mapping[str, Alignment]) -> Frame:
     """The frame with each camera turned as estimated, where the estimate rests on enough pairs."""
+    if not alignment:
+        return frame
     return frame.with_cameras(
         [
             realigned(camera, alignment[camera.name].rotation, alignment[camera.name].state[3:6])

@@ -7,7 +7,7 @@ from tempfile import TemporaryDirectory
 
 from lcf3d.datasets.base import Dataset
 from lcf3d.errors import ConfigError
-from lcf3d.files import write_json
+from lcf3d.files import copy_file, list_files, write_json
 from lcf3d.run.folder import RunFolder
 from lcf3d.run.table_folder import SHARD_FRAMES, TableRunFolder, open_run_folder, require_form
 
@@ -29,7 +29,7 @@ def convert_run(source: Path, dataset: Dataset, out: Path, form: str) -> int:
         FormatError: the run cannot be read.
     """
     require_form(form)
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+    if out.exists() and (not out.is_dir() or list_files(out)):
         raise ConfigError(f"{out} is not empty; choose another --out")
     run = open_run_folder(source)
     request = run.request()
@@ -46,7 +46,7 @@ def convert_run(source: Path, dataset: Dataset, out: Path, form: str) -> int:
     target.finish(frame_ids)
     for name in ("config.yaml", "calibration.json", "alignment.json"):
         if (source / name).is_file():
-            (out / name).write_bytes((source / name).read_bytes())
+            copy_file(source / name, out / name)
     write_json(out / "run.json", {**request, "form": form})
     return len(frame_ids)
 

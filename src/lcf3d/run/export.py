@@ -12,9 +12,11 @@ from lcf3d.errors import ConfigError, DatasetError
 from lcf3d.files import write_json
 from lcf3d.formats.labelling import ImageDetections, to_coco, to_fiftyone, to_label_studio
 from lcf3d.geometry.camera import project_boxes
+from lcf3d.remote.places import name_of
 from lcf3d.run.conversion import convert_run
 from lcf3d.run.folder import RunFolder
 from lcf3d.run.table_folder import FORMS, open_run_folder
+from lcf3d.structures import NUSCENES_CLASSES
 
 IMAGE_FORMS = ("coco", "fiftyone", "label-studio")
 SPACE_FORMS = ("nuscenes", "argoverse")
@@ -92,7 +94,7 @@ def images_of_run(
             path = getattr(frame.images, "path", lambda name: None)(name)
             yield ImageDetections(
                 f"{frame_id}/{name}",
-                "" if path is None else str(path),
+                "" if path is None else name_of(path),
                 (camera.width, camera.height),
                 boxes[kept],
                 labels[kept],
@@ -130,6 +132,9 @@ def _write_space(run: RunFolder, dataset: Dataset, frame_ids: Sequence[str], for
     from lcf3d.formats.nuscenes import write_submission as write_nuscenes
     from lcf3d.formats.nuscenes_boxes import global_from_detections
 
+    for name in dict.fromkeys(name for one in found.values() for name in np.array(one.class_names)[one.labels]):
+        if name not in NUSCENES_CLASSES:
+            raise ConfigError(f"class {str(name)!r} is none of nuScenes: not exported")
     poses = {}
     for frame_id in frame_ids:
         pose = dataset.frame(frame_id).world_from_lidar

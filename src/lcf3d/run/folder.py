@@ -9,17 +9,18 @@ OUT/...                  results in the dataset's own form: data/ID.txt for KITT
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from lcf3d.datasets.base import ResultWriter
 from lcf3d.errors import ConfigError
-from lcf3d.files import inside, list_files, read_json, read_text, reading, remove_left_overs, write_json
+from lcf3d.files import atomic_path, inside, list_files, read_json, read_text, reading, remove_left_overs, write_json
 from lcf3d.fusion.config import FusionConfig
 from lcf3d.processes import lock_folder, unlock_folder
 from lcf3d.provenance import FusedDetections
+from lcf3d.remote.places import remove
 from lcf3d.structures import Frame
 
 FORMAT = 2
@@ -125,7 +126,7 @@ class RunFolder:
             if _form(read_json(inputs)) != _form(run):
                 raise ConfigError(f"{self.path} holds a run of another --format; choose another --out")
             for file in self._own_files():
-                file.unlink(missing_ok=True)
+                remove(file)
         write_json(inputs, run)
         config.dump(settings)
 
@@ -151,6 +152,12 @@ class RunFolder:
         write_json(self.provenance_path(frame.id), fused.to_json(), indent=None)
         if self._writer is not None:
             self._writer.write(frame, fused)
+
+    def take(self, files: Mapping[str, bytes]) -> None:
+        """Take in finished files of frames that were fused elsewhere, by their paths in the folder, in that order."""
+        for name, content in files.items():
+            with atomic_path(inside(self.path, name)) as temporary:
+                temporary.write_bytes(content)
 
     @contextmanager
     def shard(self) -> Iterator[None]:

@@ -19,7 +19,8 @@ from lcf3d.fusion.memory_config import MemoryConfig
 from lcf3d.fusion.memory_smooth import smooth_sequence
 from lcf3d.fusion.memory_state import Memory
 from lcf3d.processes import end_with_parent, workers
-from lcf3d.provenance import FusedDetections, Outcome, Reason
+from lcf3d.provenance import OUTCOMES, REASONS, FusedDetections
+from lcf3d.remote.places import is_watching, watch
 from lcf3d.run.alignment import aligned_frame
 from lcf3d.run.folder import RunFolder
 from lcf3d.run.sources import DetectorOnFrames, LidarOnScans
@@ -165,11 +166,11 @@ class FrameRunner:
 def summarize(frame_id: str, fused: FusedDetections, milliseconds: dict[str, float]) -> FrameSummary:
     """Count what the fusion of one frame decided."""
     names = fused.detections.class_names
-    outputs = Counter(
-        (Outcome(outcome).name.lower(), names[label])
-        for outcome, label in zip(fused.outcomes, fused.detections.labels, strict=True)
-    )
-    dropped = Counter(Reason(reason).name.lower() for reason in fused.lidar.reason[fused.dropped_lidar])
+    # counted as numbers, named after it
+    codes = Counter(zip(fused.outcomes.tolist(), fused.detections.labels.tolist(), strict=True))
+    outputs = Counter({(OUTCOMES[outcome], names[label]): n for (outcome, label), n in codes.items()})
+    reasons = Counter(fused.lidar.reason[fused.dropped_lidar].tolist())
+    dropped = Counter({REASONS[reason]: n for reason, n in reasons.items()})
     return FrameSummary(frame_id, outputs, dropped, milliseconds=milliseconds)
 
 
@@ -178,18 +179,31 @@ _worker: FrameRunner
 
 def _start_worker(runner: FrameRunner | bytes) -> None:
     global _worker
-    _worker = pickle.loads(runner) if isinstance(runner, bytes) else runner
+    if isinstance(runner, bytes):
+        # a process that was started anew knows nothing of places elsewhere
+        elsewhere, content = pickle.loads(runner)
+        if elsewhere:
+            watch()
+        _worker = pickle.loads(content)
+    else:
+        _worker = runner
     end_with_parent()
 
 
 def _work(frame_ids: Sequence[str]) -> list[FrameSummary]:
-    return list(_shard(_worker, frame_ids))
+    return list(run_shard(_worker, frame_ids))
 
 
-def _shard(runner: FrameRunner, frame_ids: Sequence[str]) -> Iterator[FrameSummary]:
+def run_shard(runner: FrameRunner, frame_ids: Sequence[str]) -> Iterator[FrameSummary]:
     """Summaries of the frames of one shard; its files are there when the last is taken."""
     with runner.folder.shard():
         yield from runner.run_sequence(frame_ids)
+
+
+def shards_of(folder: RunFolder, frame_ids: Sequence[str], size: int) -> list[Sequence[str]]:
+    """Stretches of frames of that size; tables have the same shards whoever fuses them."""
+    size = SHARD_FRAMES if isinstance(folder, TableRunFolder) else size
+    return [frame_ids[start : start + size] for start in range(0, len(frame_ids), size)]
 
 
 def run_frames(
@@ -208,13 +222,10 @@ def run_frames(
         ConfigError: processes cannot be forked, and what runs cannot be sent to them.
     """
     if sequences is None:
-        # tables have the same shards whatever the number of processes
-        tables = isinstance(runner.folder, TableRunFolder)
-        size = SHARD_FRAMES if tables else max(1, min(16, len(frame_ids) // (4 * jobs)))
-        sequences = [frame_ids[start : start + size] for start in range(0, len(frame_ids), size)]
+        sequences = shards_of(runner.folder, frame_ids, max(1, min(16, len(frame_ids) // (4 * jobs))))
     if jobs <= 1:
         for sequence in sequences:
-            yield from _shard(runner, sequence)
+            yield from run_shard(runner, sequence)
         return
     method = get_start_method(allow_none=True) or ("fork" if "fork" in get_all_start_methods() else "spawn")
     # forked processes share what was read; others are sent it
@@ -232,7 +243,7 @@ def run_frames(
 
 def _pickled(runner: FrameRunner) -> bytes:
     try:
-        return pickle.dumps(runner)
+        return pickle.dumps((is_watching(), pickle.dumps(runner)))
     except Exception as error:
         raise ConfigError(
             f"what this run is made of cannot be sent to other processes ({error}), and they cannot be forked here; "

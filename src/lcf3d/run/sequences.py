@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 from lcf3d.datasets.base import Dataset
 from lcf3d.errors import DatasetError
+from lcf3d.structures import Frame
 
 
 def in_order(dataset: Dataset, frame_ids: Sequence[str]) -> list[list[str]]:
@@ -16,25 +17,31 @@ def in_order(dataset: Dataset, frame_ids: Sequence[str]) -> list[list[str]]:
     Raises:
         DatasetError: no frame tells its sequence and time, so that there is nothing to remember.
     """
-    groups: dict[str, list[tuple[float, int, str]]] = {}
-    result: list[list[str]] = []
+    return [[frame_ids[place] for place in group] for group in places_in_order(map(dataset.frame, frame_ids))]
+
+
+def places_in_order(frames: Iterable[Frame]) -> list[list[int]]:
+    """The same by place: groups of indices into ``frames``; see `in_order`."""
+    groups: dict[str, list[tuple[float, int]]] = {}
+    result: list[list[int]] = []
     placed: dict[str, int] = {}
-    for rank, frame_id in enumerate(frame_ids):
-        frame = dataset.frame(frame_id)
+    first = None
+    for place, frame in enumerate(frames):
+        first = first or frame.id
         if frame.sequence is None or frame.timestamp is None:
-            result.append([frame_id])
+            result.append([place])
             continue
         if frame.sequence not in groups:
             placed[frame.sequence] = len(result)
             result.append([])
-        groups.setdefault(frame.sequence, []).append((frame.timestamp, rank, frame_id))
-    if frame_ids and not groups:
+        groups.setdefault(frame.sequence, []).append((frame.timestamp, place))
+    if first is not None and not groups:
         raise DatasetError(
-            f"no frame tells its sequence and time (first {frame_ids[0]}), so there is no past to remember; run "
-            "without --memory, or give the frames of a drive (KITTI: ids SEQUENCE_FRAME)"
+            f"no frame tells its sequence and time (first {first}), so there is no past to remember; leave --memory "
+            "out, or give the frames of a drive (KITTI: ids SEQUENCE_FRAME)"
         )
     for sequence, members in groups.items():
-        result[placed[sequence]] = [frame_id for _, _, frame_id in sorted(members)]
+        result[placed[sequence]] = [place for _, place in sorted(members)]
     return result
 
 

@@ -104,6 +104,7 @@ class Run:
         config: settings.
         runner: what to do with a frame.
         folder: where results go.
+        request: what was asked for.
         notes: what of the inputs is left out, and which classes no camera is asked about; once a run.
     """
 
@@ -112,6 +113,7 @@ class Run:
     config: FusionConfig
     runner: FrameRunner
     folder: RunFolder
+    request: RunRequest
     notes: tuple[str, ...] = ()
 
 
@@ -142,9 +144,8 @@ def prepare_run(
     if request.shard is not None and (request.memory or request.smooth):
         raise ConfigError("--shard takes drives apart, and --memory and --smooth need them whole; leave one out")
     folder = TableRunFolder(out) if request.form == "parquet" else RunFolder(out, dataset.writer(out))
-    memory = MemoryConfig() if request.memory or request.smooth else None
     fusion = make_fusion(config, localizer)
-    runner = FrameRunner(dataset, lidar, cameras, fusion, folder, memory=memory, smooth=request.smooth)
+    runner = FrameRunner(dataset, lidar, cameras, fusion, folder, smooth=request.smooth)
     from lcf3d import __version__
 
     # checked before anything is written; with results in files this is quick
@@ -176,13 +177,16 @@ def prepare_run(
     if calibration is not None:
         calibration.dump(folder.calibration_path)
     runner.fusion = make_fusion(config, localizer, calibration, reported)
-    return Run(dataset, own_ids, config, runner, folder, notes)
+    if request.memory or request.smooth:
+        runner.memory = MemoryConfig(classes=calibration.memory if calibration else {})
+    return Run(dataset, own_ids, config, runner, folder, request, notes)
 
 
 def read_inputs(
     request: RunRequest,
     usual: Callable[[Dataset], Sequence[str]] | None = None,
     settings: FusionConfig | None = None,
+    look: bool = True,
 ) -> Inputs:
     """The dataset, settings and both branches, result files read and images looked for.
 
@@ -190,6 +194,7 @@ def read_inputs(
         request: what to read.
         usual: the frames to take where neither a split nor frames are named; all without it.
         settings: instead of those that the request names.
+        look: read all result files and look for images; else each is read when its frame comes.
 
     Raises:
         Lcf3dError: anything wrong with the request, the dataset or the result files.
@@ -208,13 +213,15 @@ def read_inputs(
     if usual is not None and not chosen and request.split is None:
         chosen = usual(dataset)
     frame_ids = require_frames(dataset, chosen, request.dataset)
-    dataset.require_complete(frame_ids)
+    if look:
+        dataset.require_complete(frame_ids)
     lidar = open_lidar(request.lidar, dataset, config.class_names, request.missing)
     cameras = by_camera(dataset, open_cameras(texts, dataset, config.class_names, request.missing, request.tiles))
-    for source in (lidar, *cameras.values()):
-        if hasattr(source, "load"):
-            source.load(frame_ids)
-    _require_images(dataset, frame_ids, cameras)
+    if look:
+        for source in (lidar, *cameras.values()):
+            if hasattr(source, "load"):
+                source.load(frame_ids)
+        _require_images(dataset, frame_ids, cameras)
     return Inputs(dataset, frame_ids, config, lidar, cameras, load_localizer(request.localizer))
 
 
@@ -332,6 +339,9 @@ def find_calibration(
 
 def _score_range(dataset: Dataset, frame_ids: Sequence[str], lidar: LidarSource) -> tuple[float, float]:
     """Lowest and highest score of the LiDAR branch over all frames, 0 and 0 without any."""
+    if hasattr(lidar, "score_range"):
+        known: tuple[float, float] = lidar.score_range(frame_ids)
+        return known
     low, high = 0.0, 0.0
     for frame_id in frame_ids:
         scores = lidar.detect(dataset.frame(frame_id)).scores

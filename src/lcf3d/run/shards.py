@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -10,7 +9,7 @@ from typing import Any
 from lcf3d.datasets.base import require_frames
 from lcf3d.datasets.opening import open_dataset
 from lcf3d.errors import ConfigError, DatasetError
-from lcf3d.files import write_json
+from lcf3d.files import copy_file, list_files, write_json
 from lcf3d.run.folder import RunFolder
 from lcf3d.run.table_folder import open_run_folder
 
@@ -49,7 +48,7 @@ def merge_shards(shards: Sequence[Path], out: Path) -> int:
         ConfigError: parts are missing, there twice, unfinished or of different runs; says which.
         DatasetError: the dataset is not where the run found it.
     """
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+    if out.exists() and (not out.is_dir() or list_files(out)):
         raise ConfigError(f"{out} is not empty; choose another --out")
     requests = {folder: RunFolder(folder).request() for folder in shards}
     _require_whole(requests)
@@ -69,11 +68,11 @@ def merge_shards(shards: Sequence[Path], out: Path) -> int:
             )
     for folder in shards:
         for name in _FOLDERS:
-            if (folder / name).is_dir():
-                shutil.copytree(folder / name, out / name, dirs_exist_ok=True)
+            for path in list_files(folder / name):
+                copy_file(path, out / name / path.name)
     for name in ("config.yaml", "calibration.json", "alignment.json"):
         if (shards[0] / name).is_file():
-            shutil.copy2(shards[0] / name, out / name)
+            copy_file(shards[0] / name, out / name)
     if request.get("form", "folder") == "folder":
         RunFolder(out, dataset.writer(out)).finish(frame_ids)
     write_json(out / "run.json", request)

@@ -11,7 +11,7 @@ name of a shard comes from its frames, so that the same run gives the same files
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -110,6 +110,11 @@ class TableRunFolder(RunFolder):
             # last: with it the frames are done
             write_frames(self.path / "provenance" / name, self._pending)
         self._pending, self._places = [], None
+
+    def take(self, files: Mapping[str, bytes]) -> None:
+        """See `RunFolder.take`."""
+        super().take(files)
+        self._places = None
 
     def read(self, frame_id: str) -> FusedDetections:
         """The result of a frame with its provenance.

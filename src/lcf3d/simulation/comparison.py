@@ -116,7 +116,7 @@ def label_statistics(root: Path, ids: Sequence[str] | None = None) -> LabelStati
     """Statistics of the label files of a KITTI-layout folder."""
     folder = root / "training" / "label_2"
     chosen = list(ids) if ids is not None else [p.stem for p in list_files(folder, ".txt")]
-    frames = [read_folder(folder, [i], results=False)[0] for i in chosen]
+    frames = read_folder(folder, chosen, results=False)
     every = KittiObjects(
         *(
             np.concatenate([getattr(f, n) for f in frames])
@@ -194,6 +194,11 @@ def summary(
     }
 
 
+REAL_LOOK = ("real KITTI", "#444444")
+SIMULATED_LOOK = ("simulated", "#d9622b")
+"""Name and colour in the figure."""
+
+
 def draw(
     real: ScanStatistics,
     simulated: ScanStatistics,
@@ -212,43 +217,47 @@ def draw(
         raise MissingExtraError("matplotlib", "simulate", "drawing the comparison") from None
     figure = Figure(figsize=(13, 7.5), dpi=90, layout="constrained")
     axes = figure.subplots(2, 3)
-    both = ((real, "real KITTI", "#444444"), (simulated, "simulated", "#d9622b"))
+    _draw_scans(axes, ((real, *REAL_LOOK), (simulated, *SIMULATED_LOOK)))
+    _draw_labels(axes, ((-0.2, real_labels, *REAL_LOOK), (0.2, simulated_labels, *SIMULATED_LOOK)))
+    for axis in axes.flat:
+        axis.grid(alpha=0.3)
+        if axis.get_legend_handles_labels()[0]:
+            axis.legend(fontsize=7)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path)
+
+
+def _draw_scans(axes: Any, both: Sequence[tuple[ScanStatistics, str, str]]) -> None:
+    """Points a scan, ranges, intensities and points an object, of scans with their name and colour."""
     bins = np.linspace(60, 140, 21)
+    centre = np.arange(len(RANGE_EDGES) - 1)
+    middle = (INTENSITY_EDGES[1:] + INTENSITY_EDGES[:-1]) / 2
+    dots: dict[str, Any] = {"marker": "o", "ms": 3}
     for s, name, colour in both:
-        axes[0, 0].hist(
-            s.counts / 1000,
-            bins,
-            alpha=0.55,
-            color=colour,
-            label=f"{name}, mean {s.counts.mean() / 1000:.1f}",
-            density=True,
-        )
-        centre = np.arange(len(RANGE_EDGES) - 1)
-        axes[0, 1].errorbar(
-            centre, s.ranges.mean(axis=0), s.ranges.std(axis=0), color=colour, capsize=3, label=name, marker="o", ms=3
-        )
-        middle = (INTENSITY_EDGES[1:] + INTENSITY_EDGES[:-1]) / 2
-        axes[0, 2].errorbar(
-            middle, s.intensities.mean(axis=0), s.intensities.std(axis=0), color=colour, capsize=2, marker="o", ms=3
-        )
+        label = f"{name}, mean {s.counts.mean() / 1000:.1f}"
+        axes[0, 0].hist(s.counts / 1000, bins, alpha=0.55, color=colour, label=label, density=True)
+        ranges = s.ranges.mean(axis=0), s.ranges.std(axis=0)
+        axes[0, 1].errorbar(centre, *ranges, color=colour, capsize=3, label=name, **dots)
+        intensities = s.intensities.mean(axis=0), s.intensities.std(axis=0)
+        axes[0, 2].errorbar(middle, *intensities, color=colour, capsize=2, **dots)
         for kind, style in (("Car", "-"), ("Pedestrian", "--"), ("Cyclist", ":")):
-            d = (DISTANCE_EDGES[1:] + DISTANCE_EDGES[:-1]) / 2
-            axes[1, 0].plot(
-                d, median_points(s.objects[kind]), style, color=colour, marker="o", ms=3, label=f"{kind}, {name}"
-            )
+            distances, medians = (DISTANCE_EDGES[1:] + DISTANCE_EDGES[:-1]) / 2, median_points(s.objects[kind])
+            axes[1, 0].plot(distances, medians, style, color=colour, label=f"{kind}, {name}", **dots)
             axes[1, 0].scatter(s.objects[kind][:, 0], s.objects[kind][:, 1], s=3, color=colour, alpha=0.25)
     axes[0, 0].set(title="points per scan (thousands)")
     axes[0, 1].set(title="share of points by range (m)", xticks=centre, yscale="log", ylim=(1e-3, 0.6))
     axes[0, 1].set_xticklabels([f"{a:g}" for a in RANGE_EDGES[:-1]], fontsize=7)
     axes[0, 2].set(title="intensity of returns")
     axes[1, 0].set(title="points per clear object by distance (m)", yscale="log", xlim=(0, 70), ylim=(1, 20000))
+
+
+def _draw_labels(axes: Any, sides: Sequence[tuple[float, LabelStatistics, str, str]]) -> None:
+    """Labels a frame and their distances, of labels with the place of their bars, name and colour."""
     names = ("Car", "Van", "Truck", "Pedestrian", "Cyclist", "DontCare")
-    sides = ((-0.2, real_labels, "real KITTI", "#444444"), (0.2, simulated_labels, "simulated", "#d9622b"))
     none = np.zeros(0)
     for shift, t, name, colour in sides:
-        axes[1, 1].bar(
-            np.arange(len(names)) + shift, [t.per_frame.get(n, 0) for n in names], 0.4, color=colour, label=name
-        )
+        counts = [t.per_frame.get(n, 0) for n in names]
+        axes[1, 1].bar(np.arange(len(names)) + shift, counts, 0.4, color=colour, label=name)
         cars, people = t.distances.get("Car", none), [t.distances.get(n, none) for n in ("Pedestrian", "Cyclist")]
         edges = np.arange(0, 85, 5)
         axes[1, 2].hist(cars, edges, density=True, alpha=0.55, color=colour, label=f"Car, {name}")
@@ -257,12 +266,6 @@ def draw(
     axes[1, 1].set(title="labels per frame", xticks=np.arange(len(names)))
     axes[1, 1].set_xticklabels(names, fontsize=8)
     axes[1, 2].set(title="distance of labels (m)")
-    for axis in axes.flat:
-        axis.grid(alpha=0.3)
-        if axis.get_legend_handles_labels()[0]:
-            axis.legend(fontsize=7)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path)
 
 
 def compare(

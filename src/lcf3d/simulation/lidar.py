@@ -157,6 +157,16 @@ def _droplets(
     measured[chosen], intensity[chosen], kept[chosen], owner[chosen] = near[first], 0.02, True, 0
 
 
+@kernel(inline="always")
+def incidence(corners, direction):  # type: ignore[no-untyped-def]
+    """Cosine of the angle between a beam (3,) and the normal of a triangle (3, 3), whichever side it hits."""
+    ax, ay, az = corners[1, 0] - corners[0, 0], corners[1, 1] - corners[0, 1], corners[1, 2] - corners[0, 2]
+    bx, by, bz = corners[2, 0] - corners[0, 0], corners[2, 1] - corners[0, 1], corners[2, 2] - corners[0, 2]
+    nx, ny, nz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+    length = math.sqrt(nx * nx + ny * ny + nz * nz) + 1e-20
+    return abs(nx * direction[0] + ny * direction[1] + nz * direction[2]) / length
+
+
 @kernel
 def reflect(  # type: ignore[no-untyped-def]
     triangle,
@@ -187,19 +197,7 @@ def reflect(  # type: ignore[no-untyped-def]
         if t < 0:
             continue
         m = material[t]
-        ax, ay, az = (
-            corners[t, 1, 0] - corners[t, 0, 0],
-            corners[t, 1, 1] - corners[t, 0, 1],
-            corners[t, 1, 2] - corners[t, 0, 2],
-        )
-        bx, by, bz = (
-            corners[t, 2, 0] - corners[t, 0, 0],
-            corners[t, 2, 1] - corners[t, 0, 1],
-            corners[t, 2, 2] - corners[t, 0, 2],
-        )
-        nx, ny, nz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
-        length = math.sqrt(nx * nx + ny * ny + nz * nz) + 1e-20
-        cosine = abs(nx * direction[i, 0] + ny * direction[i, 1] + nz * direction[i, 2]) / length
+        cosine = incidence(corners[t], direction[i])
         light = 0.3 * colour[t, 0] + 0.6 * colour[t, 1] + 0.1 * colour[t, 2]
         influence = table[m, 1]
         reflectance = table[m, 0] * (1 - influence + influence * min(max(2.2 * math.sqrt(light), 0.12), 1.5))
@@ -221,13 +219,8 @@ def reflect(  # type: ignore[no-untyped-def]
         faint = 0.30 if table[m, 4] == 6 else 0.09
         if table[m, 2] > 0:
             value = min(0.99, value * (1 + table[m, 2] * cosine * cosine))
-        signal = (
-            sensitivity
-            * reflectance
-            * (0.12 + 0.88 * cosine)
-            / (distance[i] * distance[i])
-            * math.exp(-2 * fog * distance[i])
-        )
+        clear = sensitivity * reflectance * (0.12 + 0.88 * cosine) / (distance[i] * distance[i])
+        signal = clear * math.exp(-2 * fog * distance[i])
         if chance[i, 1] < base_loss or chance[i, 2] > 1 - math.exp(-signal * 4):
             continue
         kept[i] = True

@@ -22,8 +22,6 @@ from lcf3d.training.loop import import_torch
 if TYPE_CHECKING:
     from lcf3d.detectors.camera.small_network import SmallConfig, SmallDetector
 
-INPUT_SIZE = (256, 832)
-"""(height, width) of the network's input: KITTI's proportions at two thirds of its resolution."""
 COARSEST = 32
 MASK_PARTS = ("fine", "coarse", "prototype")
 """Parts of `SmallDetector` that a network without masks lacks."""

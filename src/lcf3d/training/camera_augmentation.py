@@ -33,7 +33,7 @@ class Augmentation:
         sought: share of the views that hold a chosen pedestrian or cyclist, which are rarer than cars.
     """
 
-    scales: tuple[float, float] = (0.6, 1.7)
+    scales: tuple[float, float] = (0.5, 2.2)
     as_it_is: float = 0.4
     gain: float = 0.3
     blurred: float = 0.25

@@ -204,13 +204,17 @@ def cross_validate(
 
     See `lcf3d.evaluation.protocol.Evaluation.figures`; folds are put together as calibrated probabilities.
     """
-    figures = {}
-    for name in class_names:
-        sample, scale = collect(study, name)
-        scores = np.full(len(study.lidar.scores), np.nan)
-        for fold in np.unique(study.folds):
-            network = train_class(sample, scale, np.flatnonzero(study.folds != fold), settings)
-            test = study.folds[sample.frames] == fold
-            scores[sample.rows[test]] = network.scores(sample.pairs, len(sample.frames))[test]
-        figures[name] = study.evaluation.figures(study.rescored(scores))[name]
-    return figures
+    return {
+        name: study.evaluation.figures(study.rescored(fuse_folds(study, name, settings)))[name] for name in class_names
+    }
+
+
+def fuse_folds(study: CalibrationStudy, name: str, settings: TrainingSettings = SETTINGS) -> FloatArray:
+    """(N,) scores of the LiDAR detections of a class, each by a network trained on the other folds; NaN for others."""
+    sample, scale = collect(study, name)
+    scores = np.full(len(study.lidar.scores), np.nan)
+    for fold in np.unique(study.folds):
+        network = train_class(sample, scale, np.flatnonzero(study.folds != fold), settings)
+        test = study.folds[sample.frames] == fold
+        scores[sample.rows[test]] = network.scores(sample.pairs, len(sample.frames))[test]
+    return scores

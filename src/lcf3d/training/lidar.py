@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from lcf3d.detectors.lidar.config import LidarConfig, VoxelSpec
+from lcf3d.detectors.lidar.inputs import statistics_of
 from lcf3d.detectors.lidar.presets import COMPACT_KITTI
-from lcf3d.detectors.lidar.statistics import pillar_statistics
 from lcf3d.errors import ConfigError
 from lcf3d.evaluation.generalization import evaluate_generalization
 from lcf3d.geometry.boxes import points_in_boxes
@@ -46,6 +46,7 @@ class LidarTask:
         objects: to be pasted into scans; see `objects_of`.
         box_weight: weight of the box terms beside that of the heat.
         data: what the scans are, in words.
+        begin: exported network whose weights are begun with, see `lcf3d.training.lidar_start`.
     """
 
     scans: ScanSource
@@ -58,16 +59,26 @@ class LidarTask:
     objects: ObjectDatabase | None = None
     box_weight: float = 2.0
     data: str = ""
+    begin: Path | None = None
 
     def network(self) -> Any:
-        """The network with random weights."""
+        """The network with random weights, or with those of the exported network that it begins with."""
         from lcf3d.detectors.lidar.compact import CompactPillars
 
-        return CompactPillars.build(self.config)
+        network = CompactPillars.build(self.config)
+        if self.begin is not None:
+            from lcf3d.training.lidar_start import begin_with
+
+            begin_with(network, self.begin, self.batch(0, np.random.default_rng(7)), self.window)
+        return network
 
     def described(self) -> dict[str, Any]:
         """What batches depend on, as plain data."""
         told = {"data": self.data, "scans": self.scans.count, "network": self.config.name}
+        if self.begin is not None:
+            told["begin"] = self.begin.name
+        if self.config.painted:
+            told["painter"] = self.config.painter
         batch = {"batch_size": self.batch_size, "window": self.window, "windows_a_scan": self.windows_a_scan}
         return {**told, **batch, "box_weight": self.box_weight, **asdict(self.augmentation)}
 
@@ -114,7 +125,7 @@ def collate(windows: Sequence[tuple[LabelledScan, VoxelSpec]], config: LidarConf
     torch = import_torch()
     parts: dict[str, list[Any]] = {name: [] for name in ("features", "pillars", "heat", "counted", "cells", "boxes")}
     for number, (scan, spec) in enumerate(windows):
-        features, pillars = pillar_statistics(scan.points, spec)
+        features, pillars = statistics_of(scan.points, replace(config, voxels=spec))
         seen = crop(scan, spec.area)
         targets = center_targets(seen.boxes, seen.labels, replace(config, voxels=spec))
         parts["features"].append(features)

@@ -13,6 +13,9 @@ from numpy.typing import NDArray
 
 from lcf3d.datasets.opening import root_of
 from lcf3d.detectors.classes import class_mapping
+from lcf3d.detectors.fusion.images import image_of
+from lcf3d.detectors.fusion.painters import Painter
+from lcf3d.detectors.fusion.painting import painted_points
 from lcf3d.detectors.lidar.config import LidarConfig
 from lcf3d.detectors.lidar.grounding import LEVEL_M, level_points
 from lcf3d.errors import ConfigError, DatasetError
@@ -36,7 +39,7 @@ class LabelledScan:
     """A scan and what a detector is to find in it.
 
     Attributes:
-        points: (N, 4) float32 x, y, z, intensity, LiDAR frame; finite.
+        points: (N, 4 or more) float32 x, y, z, intensity and what the points are painted with, LiDAR frame; finite.
         boxes: (A, 7) LiDAR frame.
         labels: (A,) class, or `IGNORED` for objects that are neither to be found nor background.
         counts: (A,) returns in each box.
@@ -87,23 +90,32 @@ def simulated_scans(paths: Sequence[Path], class_names: Sequence[str]) -> ScanSo
 
 
 def dataset_scans(
-    dataset: str, split: str | None, class_names: Sequence[str], version: str | None = None
+    dataset: str,
+    split: str | None,
+    class_names: Sequence[str],
+    version: str | None = None,
+    painter: Painter | None = None,
 ) -> ScanSource:
     """Scans of ``kitti:ROOT`` or ``nuscenes:ROOT``.
 
     KITTI labels only what the left camera sees: points outside its image are left out, and scans are turned by an
-    eighth of a circle at most.
+    eighth of a circle at most. A painter gives each point its scores of ``class_names`` from that image; what it says
+    of a frame is kept, since camera networks take longer than all the rest.
 
     Raises:
         DatasetError: the dataset or the split does not exist.
-        ConfigError: the kind of dataset is unknown.
+        ConfigError: the kind of dataset is unknown, or nuScenes' points are to be painted.
     """
     kind, root = root_of(dataset, ("kitti", "nuscenes"), "the training")
     if kind == "kitti":
         from lcf3d.datasets.kitti import KittiDataset
 
         kitti = KittiDataset(root, split, class_names=LABELLED_KITTI)
-        return ScanSource(partial(_from_kitti, kitti, tuple(class_names)), len(kitti), FRONT_TURN)
+        if painter is None:
+            return ScanSource(partial(_from_kitti, kitti, tuple(class_names)), len(kitti), FRONT_TURN)
+        return ScanSource(_PaintedKitti(kitti, tuple(class_names), painter).read, len(kitti), FRONT_TURN)
+    if painter is not None:
+        raise ConfigError("points are painted from KITTI's left camera; name a KITTI folder, kitti:ROOT")
     from lcf3d.datasets.nuscenes import NuscenesDataset
 
     nuscenes = NuscenesDataset(root, version, split)
@@ -147,6 +159,26 @@ def _from_kitti(kitti: Sequence[Frame], class_names: tuple[str, ...], index: int
     # comparisons with NaN, the pixel of a point behind the camera, are false
     seen = ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=1)
     return _labelled(points[seen], frame.labels, class_names)
+
+
+class _PaintedKitti:
+    """Scans whose points carry class scores."""
+
+    def __init__(self, kitti: Sequence[Frame], class_names: tuple[str, ...], painter: Painter) -> None:
+        self.kitti, self.class_names, self.painter = kitti, class_names, painter
+        self.kept: dict[int, NDArray[np.float16]] = {}
+
+    def read(self, index: int) -> LabelledScan:
+        frame = self.kitti[index]
+        camera, points = frame.camera("left"), _points(frame)
+        points = points[np.isfinite(points).all(axis=1)]
+        if index in self.kept:
+            painted = painted_points(points, camera, None, self.painter, len(self.class_names))
+            painted[:, 4:] = self.kept[index]
+        else:
+            painted = painted_points(points, camera, image_of(frame, camera), self.painter, len(self.class_names))
+            self.kept[index] = painted[:, 4:].astype(np.float16)
+        return _labelled(painted, frame.labels, self.class_names)
 
 
 def _from_frame(frame: Frame, class_names: Sequence[str]) -> LabelledScan:

@@ -18,9 +18,11 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from lcf3d.errors import ConfigError, DetectorError
+from lcf3d.errors import ConfigError, DatasetError, DetectorError
 from lcf3d.files import atomic_path, write_json
 from lcf3d.networks.checkpoints import TRAINING_FORMAT, load_parameters, read_training
+from lcf3d.processes import lock_folder, unlock_folder
+from lcf3d.training.batches import batches, seed_of
 
 LAST = "last.pt"
 
@@ -135,7 +137,9 @@ def train(
         device: torch's name of the device to train on.
 
     Raises:
-        ConfigError: the folder holds a training already, or one with other settings or data; there is no such device.
+        ConfigError: the folder holds a training already, or one with other settings or data, or another process trains
+            there; there is no such device.
+        DatasetError: a checkpoint cannot be written (no space left, no permission).
         DetectorError: the loss is not finite (the last good checkpoint stays), or the checkpoint is another network's.
         MissingExtraError: torch is not installed.
     """
@@ -159,13 +163,25 @@ def _train(
     run = _Run(torch, task, settings, folder, rank, device)
     if start is not None:
         run.start(start)
+    if rank == 0:
+        lock_folder(folder)
+    try:
+        return _steps(run, resume, report, world)
+    finally:
+        if rank == 0:
+            unlock_folder(folder)
+
+
+def _steps(run: _Run, resume: bool, report: Callable[[Progress], None], world: int) -> Any:
+    """All steps from the checkpoint, or the beginning, on; gives the averaged network."""
+    torch, task, settings, folder, rank, device = run.torch, run.task, run.settings, run.folder, run.rank, run.device
     first = run.resume() if resume else run.begin()
     network = run.network
     if world > 1:
         network = torch.nn.parallel.DistributedDataParallel(network, broadcast_buffers=False)
     network.train()
-    for step, batch in _batches(task, settings, first, rank):
-        torch.manual_seed(_seed(settings.seed, step, rank, 1))
+    for step, batch in batches(task, settings.seed, range(first, settings.steps), settings.workers, rank):
+        torch.manual_seed(seed_of(settings.seed, step, rank, 1))
         for group in run.optimizer.param_groups:
             group["lr"] = settings.rate(step)
         terms = task.loss(network, on_device(batch, device))
@@ -272,9 +288,16 @@ class _Run:
             "optimizer": self.optimizer.state_dict(),
             "history": self.history,
         }
-        with atomic_path(self.folder / LAST) as temporary:
-            self.torch.save(state, temporary)
-        write_json(self.folder / "metrics.json", self.history)
+        try:
+            with atomic_path(self.folder / LAST) as temporary:
+                self.torch.save(state, temporary)
+            write_json(self.folder / "metrics.json", self.history)
+        except (OSError, RuntimeError) as error:
+            # torch reports a full disk as a RuntimeError of its own
+            reason = getattr(error, "strerror", None) or str(error).splitlines()[0]
+            raise DatasetError(
+                f"cannot write {self.folder / LAST}: {reason}; the one before stays: make room, go on with --resume"
+            ) from error
         return figures
 
     def note(self, done: int, terms: dict[str, Any], figures: dict[str, float]) -> Progress:
@@ -347,35 +370,6 @@ def _require_same(path: Path, then: Mapping[str, Any], now: Mapping[str, Any]) -
     if other:
         listed = ", ".join(f"{name} {then[name]!r} then and {now[name]!r} now" for name in other)
         raise ConfigError(f"{path} was trained with other settings: {listed}; use the same to go on")
-
-
-def _seed(*parts: int) -> int:
-    return int(np.random.default_rng(list(parts)).integers(2**62))
-
-
-def _batches(task: TrainingTask, settings: TrainingSettings, first: int, rank: int) -> Iterator[tuple[int, Any]]:
-    """Number and batch of every step from ``first`` on."""
-    steps = _Steps(task, settings.seed, rank)
-    if settings.workers == 0:
-        for step in range(first, settings.steps):
-            yield step, steps[step]
-        return
-    data = import_torch().utils.data
-    numbers = range(first, settings.steps)
-    loader = data.DataLoader(
-        steps, batch_size=None, sampler=numbers, num_workers=settings.workers, persistent_workers=True
-    )
-    yield from zip(numbers, loader, strict=True)
-
-
-class _Steps:
-    """Batches by step, as a map-style dataset."""
-
-    def __init__(self, task: TrainingTask, seed: int, rank: int) -> None:
-        self.task, self.seed, self.rank = task, seed, rank
-
-    def __getitem__(self, step: int) -> Any:
-        return self.task.batch(step, np.random.default_rng([self.seed, step, self.rank]))
 
 
 def _require_finite(terms: dict[str, Any], step: int, folder: Path) -> None:

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from lcf3d.geometry.boxes import LENGTH, YAW, bev_corners
 from lcf3d.geometry.camera import pixel_rays
 from lcf3d.geometry.epipolar import camera_centre
+from lcf3d.kernels import kernel
 from lcf3d.structures import Camera, FloatArray
-from lcf3d.visualization.canvas import Canvas
+from lcf3d.visualization.canvas import Canvas, Colour
 from lcf3d.visualization.scene import COLOURS, TRUTH_COLOUR, Scene
 
 _GROUND = (16, 18, 22)
@@ -98,6 +99,8 @@ def draw_bev(
     if scene.truth is not None:
         for box in scene.truth:
             canvas.lines(_outline(box, view), TRUTH_COLOUR, width=1.0, opacity=0.85)
+    for i, way in enumerate(scene.trails):
+        _draw_trail(canvas, view.pixels(way[:, :2]), COLOURS[scene.outcomes[i]])
     for i in scene.drawing_order:
         colour, outline = COLOURS[scene.outcomes[i]], _outline(scene.boxes[i], view)
         if scene.outcomes[i] == "dropped":
@@ -113,19 +116,33 @@ def draw_bev(
     return canvas.image()
 
 
+def _draw_trail(canvas: Canvas, way: FloatArray, colour: Colour) -> None:
+    """A way of (K, 2) pixels, fainter the longer ago."""
+    for k in range(1, len(way)):
+        opacity = 0.15 + 0.65 * k / (len(way) - 1)
+        canvas.lines(np.concatenate([way[k - 1], way[k]])[None], colour, width=1.6, opacity=opacity)
+
+
 def _point_picture(points: NDArray[np.float32] | None, view: BevView) -> PIL.Image.Image:
     """Points as dots, brighter with height; the highest point of a pixel shows."""
-    picture = np.empty((view.height, view.width, 3), dtype=np.uint8)
-    picture[:] = _GROUND
+    levels = np.zeros((view.height, view.width), np.uint8)
     if points is not None and len(points):
-        pixels = view.pixels(points[:, :2].astype(np.float64))
-        inside = (pixels >= 0).all(axis=1) & (pixels < [view.width, view.height]).all(axis=1)
-        columns, rows = pixels[inside].astype(np.int64).T
-        height = points[inside, 2].astype(np.float64)
-        order = np.argsort(height, kind="stable")
-        share = np.clip((height[order] - _HEIGHTS[0]) / (_HEIGHTS[1] - _HEIGHTS[0]), 0, 1)[:, None]
-        picture[rows[order], columns[order]] = (_LOW + share * (_HIGH - _LOW)).astype(np.uint8)
-    return PIL.Image.fromarray(picture)
+        _highest(np.asarray(points)[:, :3], view.pixels_per_metre, *view.origin, *_HEIGHTS, levels)
+    shades = _LOW + np.linspace(0, 1, 255)[:, None] * (_HIGH - _LOW)
+    table = np.concatenate([[_GROUND], shades]).astype(np.uint8)
+    return PIL.Image.fromarray(table.take(levels, axis=0))
+
+
+@kernel
+def _highest(points, scale, column, row, low, high, levels):  # type: ignore[no-untyped-def]
+    """Raise each pixel of uint8 ``levels`` to that of its highest point: 1 up to ``low`` metres, 255 from ``high`` on."""
+    for n in range(len(points)):
+        x, y = column + points[n, 0] * scale, row - points[n, 1] * scale
+        if x >= 0 and x < levels.shape[1] and y >= 0 and y < levels.shape[0]:
+            level = 1 + 254 * min(max((points[n, 2] - low) / (high - low), 0.0), 1.0)
+            # a height that is no number counts as none
+            if level > levels[int(y), int(x)]:
+                levels[int(y), int(x)] = np.uint8(level)
 
 
 def _draw_rings(canvas: Canvas, view: BevView, reach: float) -> None:

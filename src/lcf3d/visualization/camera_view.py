@@ -86,7 +86,9 @@ def draw_camera(
     else:
         background = PIL.Image.fromarray(image)
         if background.size != (camera.width, camera.height):
-            background = background.resize((camera.width, camera.height), PIL.Image.Resampling.LANCZOS)
+            background = background.resize(
+                (camera.width, camera.height), PIL.Image.Resampling.LANCZOS, reducing_gap=1.01
+            )
     canvas = Canvas(background)
     if image is None:
         title = f"{camera.name}: no image"

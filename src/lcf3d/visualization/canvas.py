@@ -1,4 +1,4 @@
-"""Anti-aliased lines and labels that keep out of each other's way, on Pillow alone."""
+"""Anti-aliased lines, and labels that keep out of each other's way."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ import PIL.ImageDraw
 import PIL.ImageFont
 
 from lcf3d.structures import FloatArray
+from lcf3d.visualization.strokes import Strokes
 
 Colour = tuple[int, int, int]
 
-SUPERSAMPLING = 3
 DASH, GAP = 6.0, 4.0
 _HALO = (0, 0, 0)
 _LABEL_PADDING = 2
@@ -45,17 +45,15 @@ def text_size(text: str, size: float) -> tuple[int, int]:
 class Canvas:
     """Draws over a picture; coordinates are pixels of that picture, fractions allowed.
 
-    Lines are drawn enlarged on a layer of their own and scaled down, which smooths them; text goes on top of all.
+    Lines go into the picture at once, text on top of all when it is finished.
 
     Args:
         background: RGB picture, left as it is.
     """
 
     def __init__(self, background: PIL.Image.Image) -> None:
-        self._background = background
         self.width, self.height = background.size
-        self._layer = PIL.Image.new("RGBA", (self.width * SUPERSAMPLING, self.height * SUPERSAMPLING))
-        self._draw = PIL.ImageDraw.Draw(self._layer)
+        self._strokes = Strokes(np.array(background.convert("RGB")))
         self._labels: list[_Label] = []
 
     def lines(
@@ -70,27 +68,24 @@ class Canvas:
         """Straight lines.
 
         Args:
-            segments: (M, 4) ``x1, y1, x2, y2``; rows with NaN are skipped, the rest is clipped to the picture.
+            segments: (M, 4) ``x1, y1, x2, y2``; rows with NaN are skipped.
             colour: RGB.
             width: in pixels.
             opacity: 0 to 1.
             dashed: broken lines.
             halo: a dark rim, for bright pictures.
         """
-        margin = width + 1
-        segments = clip_segments(segments, (-margin, -margin, self.width + margin, self.height + margin))
         if dashed:
-            segments = _dashes(segments)
-        passes = [(_HALO, width + 1.6, 0.55 * opacity)] if halo else []
-        for rgb, thickness, alpha in [*passes, (colour, width, opacity)]:
-            fill = (*rgb, round(255 * alpha))
-            for segment in segments * SUPERSAMPLING:
-                self._draw.line(segment.tolist(), fill=fill, width=max(1, round(thickness * SUPERSAMPLING)))
+            margin = width + 1
+            bounds = (-margin, -margin, self.width + margin, self.height + margin)
+            segments = _dashes(clip_segments(segments, bounds), width)
+        if halo:
+            self._strokes.lines(segments, _HALO, width + 1.6, 0.55 * opacity)
+        self._strokes.lines(segments, colour, width, opacity)
 
     def polygon(self, corners: FloatArray, colour: Colour, opacity: float) -> None:
         """A filled polygon with (K, 2) corners."""
-        points = [tuple(corner) for corner in (corners * SUPERSAMPLING).tolist()]
-        self._draw.polygon(points, fill=(*colour, round(255 * opacity)))
+        self._strokes.polygon(corners, colour, opacity)
 
     def label(
         self, around: Sequence[float], text: str, colour: Colour, size: float = 12.0, filled: bool = True
@@ -135,20 +130,19 @@ class Canvas:
 
     def image(self) -> PIL.Image.Image:
         """The finished RGB picture."""
-        smooth = self._layer.resize((self.width, self.height), PIL.Image.Resampling.BOX)
-        picture = PIL.Image.alpha_composite(self._background.convert("RGBA"), smooth)
-        plates = PIL.Image.new("RGBA", picture.size)
-        draw = PIL.ImageDraw.Draw(plates)
+        pixels = self._strokes.pixels
         for label in self._labels:
             if label.plate is not None:
-                x1, y1, x2, y2 = label.place
-                draw.rectangle((x1, y1, x2 - 1, y2 - 1), fill=label.plate)
-        picture = PIL.Image.alpha_composite(picture, plates)
+                x1, y1, x2, y2 = np.maximum(label.place, 0)
+                *rgb, alpha = label.plate
+                under = pixels[y1:y2, x1:x2]
+                under[:] = (under * (1 - alpha / 255) + np.array(rgb) * (alpha / 255) + 0.5).astype(np.uint8)
+        picture = PIL.Image.fromarray(pixels)
         draw = PIL.ImageDraw.Draw(picture)
         for label in self._labels:
             middle = (label.place[0] + _LABEL_PADDING, (label.place[1] + label.place[3]) / 2)
             draw.text(middle, label.text, fill=label.ink, font=font(label.size), anchor="lm")
-        return picture.convert("RGB")
+        return picture
 
 
 def clip_segments(segments: FloatArray, bounds: tuple[float, float, float, float]) -> FloatArray:
@@ -176,14 +170,14 @@ def clip_segments(segments: FloatArray, bounds: tuple[float, float, float, float
     return np.concatenate(ends, axis=1)[kept]
 
 
-def _dashes(segments: FloatArray) -> FloatArray:
-    """(K, 4) dashes of (M, 4) segments."""
+def _dashes(segments: FloatArray, width: float) -> FloatArray:
+    """(K, 4) dashes of (M, 4) segments, shorter by their round ends."""
     parts = [np.zeros((0, 4))]
     for segment in segments:
         delta = segment[2:] - segment[:2]
         length = float(np.hypot(*delta))
         starts = np.arange(0, max(length, 1e-6), DASH + GAP)
-        t = np.stack([starts, np.minimum(starts + DASH, length)], axis=1) / max(length, 1e-6)
+        t = np.stack([starts, np.clip(starts + DASH - width, starts, length)], axis=1) / max(length, 1e-6)
         parts.append((segment[:2] + t[..., None] * delta).reshape(-1, 4))
     return np.concatenate(parts)
 

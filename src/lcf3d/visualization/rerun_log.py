@@ -14,6 +14,7 @@ from lcf3d.geometry.rotation import quaternions_from_yaws
 from lcf3d.provenance import FusedDetections
 from lcf3d.structures import Camera, Detections3D, FloatArray, Frame
 from lcf3d.visualization.scene import CAMERA_COLOUR, COLOURS, TRUTH_COLOUR, Scene
+from lcf3d.visualization.trails import Trails
 
 _GREY = (110, 115, 120)
 # scans and images of more than this are thinned, so that a recording of a drive stays small
@@ -48,6 +49,7 @@ class RerunLog:
         self._stream.send_blueprint(_blueprint(rerun.blueprint, cameras))
         self._stream.log("world", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         self._index = 0
+        self._trails = Trails()
 
     def log(
         self,
@@ -67,12 +69,16 @@ class RerunLog:
             latency_ms: milliseconds by stage, for the timeline.
             alignment_deg: how far each camera has turned against its calibration, by name, for the timeline.
         """
-        scene = Scene.from_fused(fused, truth)
+        scene = Scene.from_fused(fused, truth, trails=self._trails(frame, fused))
         self._stream.set_time("frame", sequence=self._index)
         if frame.timestamp is not None:
             self._stream.set_time("time", duration=frame.timestamp)
         self._index += 1
         self._log_boxes("world/boxes", scene.boxes, [COLOURS[o] for o in scene.outcomes], scene.texts)
+        if fused.tracks is not None:
+            ways = [way for way in scene.trails if len(way) > 1]
+            colours = [COLOURS[o] for o, way in zip(scene.outcomes, scene.trails, strict=False) if len(way) > 1]
+            self._stream.log("world/trails", self._rerun.LineStrips3D(ways, colors=np.array(colours).reshape(-1, 3)))
         if scene.truth is not None:
             self._log_boxes("world/truth", scene.truth, [TRUTH_COLOUR] * len(scene.truth), ())
         self._log_points(frame.points, scene)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from lcf3d.provenance import FusedDetections, Outcome, Reason
-from lcf3d.structures import BoolArray, Detections2D, Detections3D, FloatArray
+from lcf3d.structures import BoolArray, Detections2D, Detections3D, FloatArray, IntArray
 from lcf3d.visualization.canvas import Colour
 
 # Okabe and Ito's colours, told apart with any colour vision; order of the legend and, backwards, of drawing
@@ -17,6 +17,7 @@ COLOURS: Mapping[str, Colour] = {
     "recovered": (240, 160, 0),
     "kept": (86, 180, 233),
     "downweighted": (214, 130, 178),
+    "predicted": (213, 94, 0),
     "detection": (86, 180, 233),
     "dropped": (190, 190, 190),
 }
@@ -51,6 +52,7 @@ class Scene:
         texts: (N,) labels, empty for none; earlier boxes get their labels first.
         image_boxes: 2D detections by camera name.
         truth: (K, 7) ground truth, or None.
+        trails: where each of the first boxes has been, (K, 3) places in the LiDAR frame, see `trails`; empty for none.
     """
 
     boxes: FloatArray
@@ -58,6 +60,7 @@ class Scene:
     texts: tuple[str, ...]
     image_boxes: Mapping[str, ImageBoxes] = field(default_factory=dict)
     truth: FloatArray | None = None
+    trails: Sequence[FloatArray] = ()
 
     @property
     def counts(self) -> dict[str, int]:
@@ -94,26 +97,36 @@ class Scene:
 
     @classmethod
     def from_fused(
-        cls, fused: FusedDetections, truth: Detections3D | None = None, least_score: float = -np.inf
+        cls,
+        fused: FusedDetections,
+        truth: Detections3D | None = None,
+        least_score: float = -np.inf,
+        trails: Sequence[FloatArray] = (),
     ) -> Scene:
         """Outputs of a fusion in the colour of their outcome, and the inputs that were dropped on the way.
 
-        Outputs and inputs of a lower score than ``least_score`` are left out.
+        Outputs and inputs of a lower score than ``least_score`` are left out. Tracked boxes have their track's number
+        in their text.
+
+        Args:
+            fused: the result of a frame.
+            truth: ground truth to draw, if any.
+            least_score: see above.
+            trails: where each output has been, see `lcf3d.visualization.trails`.
         """
-        outcomes = [Outcome(outcome).name.lower() for outcome in fused.outcomes]
-        lowered = fused.lidar.output[fused.lidar.reason == Reason.DOWNWEIGHTED]
-        for output in lowered[lowered >= 0]:
-            outcomes[output] = "downweighted"
+        outcomes = fused.origins
         dropped = fused.dropped_lidar
         dropped = dropped[~np.isin(fused.lidar.reason[dropped], _NOT_DRAWN)]
         dropped = dropped[fused.lidar_inputs.scores[dropped] >= least_score]
         shown = np.flatnonzero(fused.detections.scores >= least_score)
+        numbers = None if fused.tracks is None else fused.tracks.ids[shown]
         return cls(
             np.concatenate([fused.detections.boxes[shown], fused.lidar_inputs.boxes[dropped]]),
             (*(outcomes[i] for i in shown), *("dropped",) * len(dropped)),
-            (*_texts(fused.detections[shown]), *("",) * len(dropped)),
+            (*_texts(fused.detections[shown], numbers), *("",) * len(dropped)),
             _image_boxes(fused, least_score),
             None if truth is None else truth.boxes,
+            [trails[int(i)] for i in shown] if trails else (),
         )
 
 
@@ -133,8 +146,9 @@ def _image_boxes(fused: FusedDetections, least_score: float) -> dict[str, ImageB
     return result
 
 
-def _texts(detections: Detections2D | Detections3D) -> tuple[str, ...]:
-    return tuple(
+def _texts(detections: Detections2D | Detections3D, numbers: IntArray | None = None) -> tuple[str, ...]:
+    texts = tuple(
         f"{detections.class_names[label]} {score:.2f}"
         for label, score in zip(detections.labels, detections.scores, strict=True)
     )
+    return texts if numbers is None else tuple(f"{text} #{own}" for text, own in zip(texts, numbers, strict=True))

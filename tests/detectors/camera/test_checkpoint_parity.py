@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import maximum_bipartite_matching
 
 torch = pytest.importorskip("torch")
 pytest.importorskip("torchvision")
@@ -114,8 +116,11 @@ def test_detectors(golden):
 
 
 def check_predictions(data, found, pixels):
-    """The original's final boxes in order; a box may be off by some of a pixel."""
+    """The original's final boxes, each with its own of ours; nearly equal scores may have changed places."""
     boxes, scores, labels = found
-    np.testing.assert_array_equal(labels, data.arrays["prediction.labels"])
-    np.testing.assert_allclose(scores, data.arrays["prediction.scores"], atol=1e-4)
-    np.testing.assert_allclose(boxes, data.arrays["prediction.bboxes"], atol=pixels)
+    expected = [data.arrays[f"prediction.{name}"] for name in ("bboxes", "scores", "labels")]
+    assert len(boxes) == len(expected[0])
+    np.testing.assert_allclose(scores, expected[1], atol=1e-4)
+    fits = (labels[:, None] == expected[2]) & (np.abs(scores[:, None] - expected[1]) < 1e-4)
+    fits &= np.abs(boxes[:, None] - expected[0]).max(axis=2) < pixels
+    assert (maximum_bipartite_matching(csr_matrix(fits)) >= 0).all()

@@ -50,6 +50,17 @@ def test_the_whole_image_comes_back(name: str, height: int, width: int, size: tu
     np.testing.assert_allclose(placement.to_image(box), [[0, 0, width, height]], atol=1e-6)
 
 
+def test_an_image_that_almost_fills_the_input_is_not_resampled() -> None:
+    image = np.random.default_rng(0).integers(0, 256, (63, 95, 3)).astype(np.uint8)
+    values, placement = prepare_image(image, (64, 96), LAYOUTS["ultralytics"])
+    assert placement.scale == (1, 1)
+    assert placement.offset == (0, 0)
+    np.testing.assert_array_equal(values[0, :, :63, :95], image.transpose(2, 0, 1) / np.float32(255))
+    np.testing.assert_array_equal(values[0, :, 63:], np.float32(PADDING) / np.float32(255))
+    # one that is larger by as little is
+    assert prepare_image(np.zeros((65, 97, 3), np.uint8), (64, 96), LAYOUTS["ultralytics"])[1].scale[0] < 1
+
+
 def test_what_lies_in_the_padding_is_clipped() -> None:
     _, placement = prepare_image(red(50, 100), (64, 64), LAYOUTS["ultralytics"])
     clipped = placement.to_image(np.array([[-5.0, 0.0, 32.0, 64.0]]))

@@ -18,7 +18,7 @@ from lcf3d.detectors.camera.tiling import merge_tiles, non_maximum_suppression, 
 from lcf3d.detectors.classes import COCO_CLASSES, read_class_names, reported_classes, to_classes
 from lcf3d.errors import ConfigError, DetectorError, ShapeError
 from lcf3d.files import shortened
-from lcf3d.networks.onnx import first_line, open_session
+from lcf3d.networks.onnx import first_line, open_session, read_metadata
 from lcf3d.structures import KITTI_CLASSES, Detections2D
 
 log = logging.getLogger(__name__)
@@ -75,9 +75,8 @@ class OnnxDetector:
         self._iou_threshold = iou_threshold
         self._mapping = mapping
         self._imagenet = normalize == "imagenet"
-        self._threads = threads
         self._session = open_session(self.path, threads, "a camera detector")
-        metadata = self._session.get_modelmeta().custom_metadata_map
+        metadata = read_metadata(self._session, path)
         image_input = self._image_input()
         self._image_name: str = image_input.name
         self._dtype = _IMAGE_TYPES[image_input.type]
@@ -167,13 +166,6 @@ class OnnxDetector:
             return list(self._session.run(self._outputs, inputs))
         except Exception as error:  # onnxruntime's exceptions share no base class
             raise DetectorError(f"{self.path} cannot be run on an image: {first_line(error)}") from error
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in self.__dict__.items() if name != "_session"}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        # a session cannot travel to another process: each opens its own
-        self.__dict__.update(state, _session=open_session(state["path"], state["_threads"], "a camera detector"))
 
     def _input_names(self) -> list[str]:
         return [node.name for node in self._session.get_inputs()]

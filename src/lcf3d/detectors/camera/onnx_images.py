@@ -10,10 +10,13 @@ from numpy.typing import NDArray
 
 from lcf3d.detectors.base import Image
 from lcf3d.detectors.camera.onnx_layouts import Layout
+from lcf3d.kernels import kernel
 from lcf3d.structures import FloatArray, InstanceMask
 
 # the grey that fills what a letterbox leaves free, as YOLOX and Ultralytics train with
 PADDING = 114
+ALMOST = 1.02
+"""An image that would be magnified by less than this is taken as it is: resampling would blur it for nothing."""
 IMAGENET_MEAN = np.array([0.485, 0.456, 0.406], dtype=np.float32)
 IMAGENET_STD = np.array([0.229, 0.224, 0.225], dtype=np.float32)
 
@@ -59,19 +62,31 @@ def prepare_image(
     height, width = image.shape[:2]
     scales = (size[1] / width, size[0] / height)
     if layout.fit != "stretch":
-        scales = (min(scales),) * 2
+        scale = min(scales)
+        scales = (1.0 if 1 < scale < ALMOST else scale,) * 2
     fitted = (max(1, round(width * scales[0])), max(1, round(height * scales[1])))
-    resized = np.asarray(PIL.Image.fromarray(image).resize(fitted, PIL.Image.Resampling.BILINEAR))
+    resized = image
+    if fitted != (width, height):
+        resized = np.asarray(PIL.Image.fromarray(image).resize(fitted, PIL.Image.Resampling.BILINEAR))
     free = (size[1] - fitted[0], size[0] - fitted[1])
     offset = (free[0] // 2, free[1] // 2) if layout.fit == "centre" else (0, 0)
-    canvas = np.full((*size, 3), PADDING, dtype=np.uint8)
-    canvas[offset[1] : offset[1] + fitted[1], offset[0] : offset[0] + fitted[0]] = resized
-    values = canvas[..., :: -1 if layout.bgr else 1].astype(np.float32) / np.float32(layout.divisor)
+    values = np.full((1, 3, *size), np.float32(PADDING) / np.float32(layout.divisor), dtype=np.float32)
+    _fill(values[0], np.ascontiguousarray(resized), offset[0], offset[1], layout.bgr, np.float32(layout.divisor))
     if imagenet:
-        values = (values - IMAGENET_MEAN) / IMAGENET_STD
+        values = (values - IMAGENET_MEAN[:, None, None]) / IMAGENET_STD[:, None, None]
     # the image was rounded to whole pixels, so the true scale is that of the rounded size
     placement = Placement((fitted[0] / width, fitted[1] / height), offset, width, height)
-    return np.ascontiguousarray(values.transpose(2, 0, 1)[None]), placement
+    return values, placement
+
+
+@kernel
+def _fill(values, image, left, top, bgr, divisor):  # type: ignore[no-untyped-def]
+    """Put (h, w, 3) pixels over a divisor into the planes (3, H, W), from a place on."""
+    for channel in range(3):
+        source = 2 - channel if bgr else channel
+        for y in range(image.shape[0]):
+            for x in range(image.shape[1]):
+                values[channel, top + y, left + x] = np.float32(image[y, x, source]) / divisor
 
 
 def instance_masks(
@@ -109,7 +124,7 @@ def instance_masks(
         above, below, down = _interpolation(y, shape[0])
         corner_x, corner_y = int(left[0]), int(above[0])
         crop = prototypes[:, corner_y : int(below[-1]) + 1, corner_x : int(right[-1]) + 1]
-        logits = np.tensordot(weights, crop, axes=1)
+        logits = np.tensordot(np.asarray(weights, dtype=crop.dtype), crop, axes=1)
         wide = logits[:, left - corner_x] * (1 - across) + logits[:, right - corner_x] * across
         full = wide[above - corner_y] * (1 - down[:, None]) + wide[below - corner_y] * down[:, None]
         masks.append(InstanceMask(int(first[0]), int(first[1]), full > 0))
@@ -118,8 +133,8 @@ def instance_masks(
 
 def _interpolation(
     positions: FloatArray, length: int
-) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.float64]]:
+) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.float32]]:
     """Lower and upper cell and the upper one's weight for each position; ends are held."""
     positions = np.clip(positions, 0, length - 1)
     lower = np.floor(positions).astype(np.intp)
-    return lower, np.minimum(lower + 1, length - 1), positions - lower
+    return lower, np.minimum(lower + 1, length - 1), (positions - lower).astype(np.float32)

@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
+from lcf3d.detectors.camera.small import INPUT_SIZE
 from lcf3d.detectors.camera.small_network import SmallDetector
 from lcf3d.errors import ConfigError, MissingExtraError
 from lcf3d.files import atomic_path
@@ -19,7 +20,7 @@ def export_small(
     network: SmallDetector,
     path: Path | str,
     names: Sequence[str] = KITTI_CLASSES,
-    size: tuple[int, int] = (256, 832),
+    size: tuple[int, int] = INPUT_SIZE,
 ) -> None:
     """Write a detector as an ONNX file that takes images of any size in multiples of 32 pixels.
 

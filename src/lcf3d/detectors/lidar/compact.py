@@ -16,8 +16,13 @@ from lcf3d.detectors.lidar.encoders import StatisticsEncoder, scatter_pillars
 from lcf3d.detectors.lidar.heads import LightCenterHead
 from lcf3d.detectors.lidar.inputs import Inputs, encoder_inputs
 from lcf3d.detectors.lidar.necks import SecondFPN
-from lcf3d.detectors.lidar.statistics import FEATURES
+from lcf3d.detectors.lidar.statistics import FEATURES, OF_PAINT
 from lcf3d.networks.torch import Tensor, nn, torch
+
+
+def statistics_width(config: LidarConfig) -> int:
+    """Values of a pillar that the network takes."""
+    return FEATURES + OF_PAINT * len(config.painted)
 
 
 class CompactNetwork(nn.Module):
@@ -27,7 +32,7 @@ class CompactNetwork(nn.Module):
         super().__init__()
         assert config.centers is not None
         self.width, self.height, _ = config.voxels.grid
-        self.voxel_encoder = StatisticsEncoder(FEATURES, 64, 32)
+        self.voxel_encoder = StatisticsEncoder(statistics_width(config), 64, 32)
         self.backbone = SecondBackbone(32, (32, 64, 128), layers=(2, 3, 3), strides=(2, 2, 2))
         self.neck = SecondFPN((32, 64, 128), (24, 24, 24), (1, 2, 4), convolve_unscaled=True)
         self.bbox_head = LightCenterHead(72, 48, config.centers)
@@ -38,7 +43,7 @@ class CompactNetwork(nn.Module):
         """Output maps of the head.
 
         Args:
-            features: (P, FEATURES) pillar statistics of all scans.
+            features: (P, `statistics_width`) pillar statistics of all scans.
             cells: (P,) int64 flat cell of each pillar; those of scan ``i`` start at ``i * height * width``.
             scans: number of scans.
             grid: width and height of the maps in pillars, multiples of 8; those of the configuration without it.

@@ -141,6 +141,11 @@ class LidarConfig:
             everything is canonical.
         cloud: what it was trained on: earlier sweeps, or the part that a camera sees.
         tall: points above and below the volume stay among the raw points of a two-stage network (OpenPCDet).
+        upright: classes whose boxes are held against the heights of the returns in them, see
+            `lcf3d.detectors.lidar.upright`.
+        painted: classes whose scores follow the four columns of each point (`lcf3d.detectors.fusion.painting`).
+        painter: what they were painted with in training.
+        only_painted: points without any score are left out.
     """
 
     name: str
@@ -159,6 +164,10 @@ class LidarConfig:
     frame: str = "canonical"
     cloud: CloudRequest = SCAN
     tall: bool = False
+    upright: tuple[str, ...] = ()
+    painted: tuple[str, ...] = ()
+    painter: str = ""
+    only_painted: bool = False
 
     def __post_init__(self) -> None:
         if self.ground not in GROUND_MODES:

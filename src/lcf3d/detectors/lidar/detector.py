@@ -17,6 +17,7 @@ from lcf3d.detectors.lidar.fusing import fuse_batch_norm
 from lcf3d.detectors.lidar.grounding import ground_of, grounded, levelled
 from lcf3d.detectors.lidar.inputs import Inputs, map_detections, pillar_inputs
 from lcf3d.detectors.lidar.suppression import NmsMode, suppression_threshold
+from lcf3d.detectors.lidar.upright import checked
 from lcf3d.errors import ConfigError
 from lcf3d.networks.torch import Tensor, nn, torch, torch_device
 from lcf3d.structures import Detections3D
@@ -135,7 +136,7 @@ class TorchLidarDetector(ABC):
             )
         with torch.inference_mode():
             found = self.detect({name: torch.from_numpy(value).to(self.device) for name, value in inputs.items()})
-        return grounded(found, ground, self.config)
+        return checked(grounded(found, ground, self.config), points, self.config, self.score_threshold)
 
     @abstractmethod
     def inputs(self, points: NDArray[np.floating]) -> Inputs | None:

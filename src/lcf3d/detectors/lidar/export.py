@@ -6,13 +6,12 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from lcf3d.detectors.lidar.compact import CompactNetwork
+from lcf3d.detectors.lidar.compact import CompactNetwork, statistics_width
 from lcf3d.detectors.lidar.config import LidarConfig
 from lcf3d.detectors.lidar.detector import TorchLidarDetector
 from lcf3d.detectors.lidar.heads import center_channels
 from lcf3d.detectors.lidar.onnx import CONFIG_KEY
 from lcf3d.detectors.lidar.pillars import PillarNetwork
-from lcf3d.detectors.lidar.statistics import FEATURES
 from lcf3d.errors import DetectorError, MissingExtraError
 from lcf3d.files import atomic_path
 from lcf3d.networks.torch import Tensor, nn, torch
@@ -58,7 +57,7 @@ def _example(config: LidarConfig) -> tuple[Tensor, ...]:
     """Inputs of two pillars to trace the network with."""
     cells = torch.tensor([0, 1])
     if config.encoding == "statistics":
-        return torch.zeros(2, FEATURES), cells
+        return torch.zeros(2, statistics_width(config)), cells
     return torch.zeros(3, len(config.channels) + 6), torch.tensor([0, 0, 1]), torch.ones(2, 1), cells
 
 

@@ -22,14 +22,21 @@ def _pairs(module: nn.Module) -> Iterator[tuple[str, str]]:
         yield from (pair for pair in _NAMED_PAIRS if all(hasattr(module, name) for name in pair))
 
 
+def normalized_layers(network: nn.Module) -> list[tuple[str, nn.Module, str, str]]:
+    """Name and module that hold a layer and the normalization of its output, and the names of these two in it."""
+    return [
+        (name, module, layer, norm)
+        for name, module in network.named_modules()
+        for layer, norm in _pairs(module)
+        if isinstance(module._modules.get(layer), _LAYERS) and isinstance(module._modules.get(norm), _NORMS)
+    ]
+
+
 def fuse_batch_norm(network: nn.Module) -> nn.Module:
     """``network`` (in evaluation mode) with every normalization folded into the layer before it."""
-    for module in list(network.modules()):
-        for layer_name, norm_name in list(_pairs(module)):
-            layer, norm = module._modules.get(layer_name), module._modules.get(norm_name)
-            if isinstance(layer, _LAYERS) and isinstance(norm, _NORMS):
-                _fold(layer, norm)
-                module._modules[norm_name] = nn.Identity()
+    for _, module, layer_name, norm_name in normalized_layers(network):
+        _fold(module.get_submodule(layer_name), module.get_submodule(norm_name))
+        module._modules[norm_name] = nn.Identity()
     return network
 
 

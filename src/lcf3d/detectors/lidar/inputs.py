@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from lcf3d.detectors.lidar.config import LidarConfig
 from lcf3d.detectors.lidar.decoding import decode_anchor_maps, decode_center_maps, detections, select_by_class
 from lcf3d.detectors.lidar.frames import turned_points
-from lcf3d.detectors.lidar.statistics import pillar_statistics
+from lcf3d.detectors.lidar.statistics import painted_statistics, pillar_statistics
 from lcf3d.detectors.lidar.suppression import NmsMode
 from lcf3d.detectors.lidar.voxelization import Voxels, decorate, in_area, select_channels, voxelize
 from lcf3d.structures import Detections3D
@@ -50,8 +50,21 @@ def encoder_inputs(points: NDArray[np.floating], config: LidarConfig) -> Inputs 
     """
     if config.encoding == "points":
         return pillar_inputs(points, config)
-    features, cells = pillar_statistics(points, config.voxels)
+    features, cells = statistics_of(points, config)
     return {"features": features, "cells": cells} if len(cells) else None
+
+
+def statistics_of(points: NDArray[np.floating], config: LidarConfig) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    """Statistics of the pillars, of painted points too, and the flat cell of each.
+
+    Raises:
+        ShapeError: the points have too few columns, or are not painted as the network wants it.
+    """
+    if not config.painted:
+        return pillar_statistics(points, config.voxels)
+    if config.only_painted and points.shape[1] > 4:
+        points = points[(points[:, 4:] > 0).any(axis=1)]
+    return painted_statistics(points, config.voxels, len(config.painted))
 
 
 def voxel_inputs(voxels: Voxels) -> Inputs:

@@ -127,8 +127,17 @@ def shipped(
     Raises:
         DetectorError: there is no network of that name.
     """
+    return onnx_lidar(str(shipped_path(name)), class_names, nms, score_threshold, threads)
+
+
+def shipped_path(name: str) -> Path:
+    """The file of a network that comes with lcf3d.
+
+    Raises:
+        DetectorError: there is no network of that name.
+    """
     path = MODELS / f"lidar_{name}.onnx"
     if not path.is_file():
         known = ", ".join(sorted(p.stem.removeprefix("lidar_") for p in MODELS.glob("lidar_*.onnx"))) or "none"
         raise DetectorError(f"lcf3d ships no LiDAR network {name!r}; it has: {known}")
-    return onnx_lidar(str(path), class_names, nms, score_threshold, threads)
+    return path

@@ -14,9 +14,10 @@ from lcf3d.detectors.lidar.config import LidarConfig
 from lcf3d.detectors.lidar.grounding import ground_of, grounded, levelled
 from lcf3d.detectors.lidar.inputs import encoder_inputs, map_detections
 from lcf3d.detectors.lidar.suppression import NmsMode, suppression_threshold
+from lcf3d.detectors.lidar.upright import checked
 from lcf3d.errors import ConfigError, DetectorError
 from lcf3d.files import shortened
-from lcf3d.networks.onnx import open_session
+from lcf3d.networks.onnx import open_session, read_metadata
 from lcf3d.structures import Detections3D
 
 CONFIG_KEY = "lcf3d.lidar_config"
@@ -49,7 +50,7 @@ class OnnxLidarDetector:
         if score_threshold is not None and not 0 <= score_threshold < 1:
             raise ConfigError(f"score_threshold must be in [0, 1), got {score_threshold}")
         self._session = open_session(Path(path), threads, "a LiDAR network")
-        metadata = self._session.get_modelmeta().custom_metadata_map
+        metadata = read_metadata(self._session, path)
         if CONFIG_KEY not in metadata:
             raise DetectorError(f"{path} was not exported by lcf3d: it holds no {CONFIG_KEY}")
         try:
@@ -71,15 +72,20 @@ class OnnxLidarDetector:
         """The classes that labels index."""
         return self.config.class_names
 
-    def __call__(self, points: NDArray[np.floating]) -> Detections3D:
-        """Detections in (N, 4 or more) points, as of `lcf3d.detectors.lidar.detector.TorchLidarDetector`."""
-        ground = ground_of(points, self.config)
+    def __call__(self, points: NDArray[np.floating], around: NDArray[np.floating] | None = None) -> Detections3D:
+        """Detections in (N, 4 or more) points, as of `lcf3d.detectors.lidar.detector.TorchLidarDetector`.
+
+        Args:
+            points: the cloud.
+            around: the whole scan, to find the ground in, where ``points`` are a part of it.
+        """
+        ground = ground_of(points if around is None else around, self.config)
         inputs = encoder_inputs(levelled(points, ground, self.config), self.config)
         if inputs is None:
             velocities = np.zeros((0, 2)) if self.config.has_velocity else None
             return Detections3D(np.zeros((0, 7)), np.zeros(0), np.zeros(0, np.int64), self.class_names, velocities)
         found = map_detections(self.maps(inputs), self.config, self.score_threshold, self.nms)
-        return grounded(found, ground, self.config)
+        return checked(grounded(found, ground, self.config), points, self.config, self.score_threshold)
 
     def maps(self, inputs: dict[str, NDArray[Any]]) -> list[Any]:
         """The head's maps, without batch axis, from the arrays of `encoder_inputs`."""

@@ -227,7 +227,23 @@ COMPACT_KITTI = LidarConfig(
     ),
     encoding="statistics",
     ground="level",
+    upright=("Pedestrian", "Cyclist"),
 )
+
+
+def painted_config(painter: str, only_painted: bool = False) -> LidarConfig:
+    """The compact network on points that carry class scores.
+
+    Args:
+        painter: what paints them.
+        only_painted: whether points without any score are left out.
+    """
+    classes = COMPACT_KITTI.class_names
+    kind = "frustum" if only_painted else "painted"
+    return replace(
+        COMPACT_KITTI, name=f"compact-kitti-{kind}", painted=classes, painter=painter, only_painted=only_painted
+    )
+
 
 PRESETS: dict[str, LidarConfig] = {
     config.name: config

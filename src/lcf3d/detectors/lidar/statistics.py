@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from lcf3d.detectors.lidar.config import VoxelSpec
 from lcf3d.detectors.lidar.voxelization import select_channels
+from lcf3d.errors import ShapeError
 from lcf3d.kernels import kernel
 
 QUARTERS = 4
@@ -23,6 +24,8 @@ OWN = 15
 OF_QUARTER = 4
 FEATURES = OWN + QUARTERS * OF_QUARTER + SLICES
 """Values of a pillar in all."""
+OF_PAINT = 2
+"""Values of a pillar of each score that its points are painted with: mean and highest."""
 FAR_M = 70.0
 
 
@@ -48,6 +51,33 @@ def pillar_statistics(points: NDArray[np.floating], spec: VoxelSpec) -> tuple[ND
     values = select_channels(points, ("x", "y", "z", "intensity")) if _must_copy(points) else points
     features, cells = _gather(values, np.array(spec.area), np.array(spec.size), np.array(spec.grid))
     return features, cells
+
+
+def painted_statistics(
+    points: NDArray[np.floating], spec: VoxelSpec, painted: int
+) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    """`pillar_statistics`, and mean and highest of each score that the points are painted with.
+
+    Args:
+        points: (N, 4 + painted) ``x, y, z, intensity`` and scores.
+        spec: pillar size and volume.
+        painted: number of scores.
+
+    Returns:
+        (P, FEATURES + OF_PAINT * painted) float32 values, and the (P,) int64 flat cell of each pillar.
+
+    Raises:
+        ShapeError: another number of columns.
+    """
+    if points.ndim != 2 or points.shape[1] != 4 + painted:
+        raise ShapeError(
+            f"the network takes points with {painted} class scores each, (N, {4 + painted}), got {points.shape}; "
+            "give its file to a detector that paints them, painted:FILE or frustum-pillars:FILE"
+        )
+    features, cells = pillar_statistics(np.ascontiguousarray(points[:, :4], dtype=np.float32), spec)
+    values = np.ascontiguousarray(points, dtype=np.float32)
+    paint = _gather_paint(values, np.array(spec.area), np.array(spec.size), np.array(spec.grid), cells, painted)
+    return np.concatenate([features, paint], axis=1), cells
 
 
 def _must_copy(points: NDArray[np.floating]) -> bool:
@@ -144,3 +174,33 @@ def _finish(row, center_x, center_y):  # type: ignore[no-untyped-def]
         row[first + 3] /= m
     for column in range(OWN + QUARTERS * OF_QUARTER, FEATURES):
         row[column] = math.log1p(row[column])
+
+
+@kernel
+def _gather_paint(points, area, size, grid, cells, painted):  # type: ignore[no-untyped-def]
+    """(P, OF_PAINT * painted) means, then maxima, of the scores of the pillars in ``cells``."""
+    nx, ny = grid[0], grid[1]
+    row_of = np.full(nx * ny, -1, np.int32)
+    for k in range(len(cells)):
+        row_of[cells[k]] = k
+    values = np.zeros((len(cells), OF_PAINT * painted), np.float32)
+    counts = np.zeros(len(cells), np.float32)
+    for i in range(len(points)):
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        # comparisons with NaN are false
+        if not (area[0] < x < area[3] and area[1] < y < area[4] and area[2] < z < area[5]):
+            continue
+        if not math.isfinite(points[i, 3]):
+            continue
+        column, row = int((x - area[0]) / size[0]), int((y - area[1]) / size[1])
+        if column >= nx or row >= ny:
+            continue
+        k = row_of[row * nx + column]
+        counts[k] += 1
+        for j in range(painted):
+            values[k, j] += points[i, 4 + j]
+            values[k, painted + j] = max(values[k, painted + j], points[i, 4 + j])
+    for k in range(len(cells)):
+        for j in range(painted):
+            values[k, j] /= counts[k]
+    return values

@@ -4,7 +4,7 @@
 const DATA = JSON.parse(document.getElementById("data").textContent);
 const COLOURS = ["#2563eb", "#d97706", "#059669", "#a855f7", "#dc2626", "#0891b2", "#65a30d", "#db2777", "#64748b", "#a16207"];
 const FILLS = { right: "#1d4ed8", wrong: "#b91c1c", missed: "#b45309", found: "#15803d", matched: "#1d4ed8", recovered: "#0f766e",
-  downweighted: "#7c3aed", kept: "#475569", unknown: "#64748b" };
+  downweighted: "#7c3aed", kept: "#475569", predicted: "#be185d", unknown: "#64748b" };
 const RANGES = [[0, 20], [20, 40], [40, null]];
 const PAGE = 25;
 const SHOWN_AT_FIRST = ["right", "wrong", "missed", "found"];

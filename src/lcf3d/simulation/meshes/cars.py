@@ -16,6 +16,9 @@ PAINT_MARK: Final = slot(0)
 _BLACK: Final = (0.02, 0.02, 0.022)
 _GLASS: Final = (0.025, 0.03, 0.032)
 
+STANDS_OUT_M = 0.012
+"""What is put on the front stands out of it by so much."""
+
 
 def _stations(shape: CarShape, fine: bool) -> NDArray[np.float64]:
     """Positions along the body at which it gets a cross-section, front to rear."""
@@ -128,75 +131,100 @@ def _colour_body(body: Mesh, shape: CarShape, s: NDArray[np.float64], glass: NDA
 
 def _details(shape: CarShape, fine: bool) -> list[Mesh]:
     """Lamps, grille, plates, bumpers, mirrors and door lines."""
-    length, width, height = shape.size
-    half_l, half_w = length / 2, width / 2
-    tall = shape.size[2] > 1.9
-    lamp_z = (0.34 if tall else 0.45) * height
     parts: list[Mesh] = []
-    e = 0.012
     for side in (1.0, -1.0):
-        inner, outer = 0.42 * half_w * side, 0.845 * half_w * side
-        high = 0.055 * height
-        parts.append(
-            panel(
-                (half_l + e - 0.012, inner, lamp_z - high),
-                (half_l - 0.035, outer, lamp_z - high * 0.8),
-                (half_l - 0.075, outer, lamp_z + high * 1.25),
-                (half_l - 0.022, inner, lamp_z + high * 0.8),
-                "headlamp",
-                (0.30, 0.32, 0.34),
-            )
-        )
-        parts.append(
-            panel(
-                (half_l - 0.035, outer, lamp_z - high * 0.8),
-                (half_l - 0.24, 0.963 * half_w * side, lamp_z),
-                (half_l - 0.30, 0.965 * half_w * side, lamp_z + high * 1.4),
-                (half_l - 0.075, outer, lamp_z + high * 1.25),
-                "headlamp",
-                (0.30, 0.32, 0.34),
-            )
-        )
-        rear_z, rear_h = (0.42 if tall else 0.53) * height, (0.12 if tall else 0.075) * height
-        rin = (0.74 if tall else 0.52) * half_w * side
-        parts.append(
-            panel(
-                (-half_l - 0.004, rin, rear_z - rear_h),
-                (-half_l + 0.025, 0.86 * half_w * side, rear_z - rear_h),
-                (-half_l + 0.06, 0.86 * half_w * side, rear_z + rear_h),
-                (-half_l + 0.022, rin, rear_z + rear_h),
-                "tail_lamp",
-                (0.40, 0.012, 0.012),
-            )
-        )
-        parts.append(
-            panel(
-                (-half_l + 0.02, 0.868 * half_w * side, rear_z - rear_h),
-                (-half_l + 0.17, 0.962 * half_w * side, rear_z - rear_h * 0.5),
-                (-half_l + 0.19, 0.962 * half_w * side, rear_z + rear_h),
-                (-half_l + 0.055, 0.868 * half_w * side, rear_z + rear_h),
-                "tail_lamp",
-                (0.40, 0.012, 0.012),
-            )
-        )
-        mirror_x = (0.5 - shape.side_glass[0] - 0.01) * length
-        mirror_z = (shape.belt[0] + 0.035) * height
-        at = 0.87 * half_w * side
-        parts.append(
-            tube(
-                [
-                    (mirror_x + 0.05, at, mirror_z),
-                    (mirror_x, at + 0.06 * side, mirror_z),
-                    (mirror_x - 0.02, at + 0.10 * side, mirror_z),
-                ],
-                [0.02, 0.07, 0.05],
-                "paint",
-                PAINT_MARK,
-                6,
-            )
-        )
+        parts += [*_headlamp(shape, side), *_tail_lamp(shape, side), *_mirror(shape, side)]
+    return [*parts, *_grille(shape), *_plates(shape), *(_door_lines(shape) if fine else [])]
+
+
+def _is_tall(shape: CarShape) -> bool:
+    return shape.size[2] > 1.9
+
+
+def _lamp_height(shape: CarShape) -> float:
+    """Metres over the ground at which the headlamps are."""
+    return (0.34 if _is_tall(shape) else 0.45) * shape.size[2]
+
+
+def _headlamp(shape: CarShape, side: float) -> list[Mesh]:
+    """The headlamp of a side: its front, and where it goes round the corner."""
+    half_l, half_w, height = shape.size[0] / 2, shape.size[1] / 2, shape.size[2]
+    lamp_z, e = _lamp_height(shape), STANDS_OUT_M
+    inner, outer = 0.42 * half_w * side, 0.845 * half_w * side
+    high = 0.055 * height
+    return [
+        panel(
+            (half_l + e - 0.012, inner, lamp_z - high),
+            (half_l - 0.035, outer, lamp_z - high * 0.8),
+            (half_l - 0.075, outer, lamp_z + high * 1.25),
+            (half_l - 0.022, inner, lamp_z + high * 0.8),
+            "headlamp",
+            (0.30, 0.32, 0.34),
+        ),
+        panel(
+            (half_l - 0.035, outer, lamp_z - high * 0.8),
+            (half_l - 0.24, 0.963 * half_w * side, lamp_z),
+            (half_l - 0.30, 0.965 * half_w * side, lamp_z + high * 1.4),
+            (half_l - 0.075, outer, lamp_z + high * 1.25),
+            "headlamp",
+            (0.30, 0.32, 0.34),
+        ),
+    ]
+
+
+def _tail_lamp(shape: CarShape, side: float) -> list[Mesh]:
+    """The tail lamp of a side, likewise."""
+    half_l, half_w, height = shape.size[0] / 2, shape.size[1] / 2, shape.size[2]
+    tall = _is_tall(shape)
+    rear_z, rear_h = (0.42 if tall else 0.53) * height, (0.12 if tall else 0.075) * height
+    rin = (0.74 if tall else 0.52) * half_w * side
+    return [
+        panel(
+            (-half_l - 0.004, rin, rear_z - rear_h),
+            (-half_l + 0.025, 0.86 * half_w * side, rear_z - rear_h),
+            (-half_l + 0.06, 0.86 * half_w * side, rear_z + rear_h),
+            (-half_l + 0.022, rin, rear_z + rear_h),
+            "tail_lamp",
+            (0.40, 0.012, 0.012),
+        ),
+        panel(
+            (-half_l + 0.02, 0.868 * half_w * side, rear_z - rear_h),
+            (-half_l + 0.17, 0.962 * half_w * side, rear_z - rear_h * 0.5),
+            (-half_l + 0.19, 0.962 * half_w * side, rear_z + rear_h),
+            (-half_l + 0.055, 0.868 * half_w * side, rear_z + rear_h),
+            "tail_lamp",
+            (0.40, 0.012, 0.012),
+        ),
+    ]
+
+
+def _mirror(shape: CarShape, side: float) -> list[Mesh]:
+    """The mirror of a side."""
+    length, half_w, height = shape.size[0], shape.size[1] / 2, shape.size[2]
+    mirror_x = (0.5 - shape.side_glass[0] - 0.01) * length
+    mirror_z = (shape.belt[0] + 0.035) * height
+    at = 0.87 * half_w * side
+    return [
+        tube(
+            [
+                (mirror_x + 0.05, at, mirror_z),
+                (mirror_x, at + 0.06 * side, mirror_z),
+                (mirror_x - 0.02, at + 0.10 * side, mirror_z),
+            ],
+            [0.02, 0.07, 0.05],
+            "paint",
+            PAINT_MARK,
+            6,
+        ),
+    ]
+
+
+def _grille(shape: CarShape) -> list[Mesh]:
+    """Grille and lower bumper of the front."""
+    half_l, half_w, height = shape.size[0] / 2, shape.size[1] / 2, shape.size[2]
+    lamp_z, e = _lamp_height(shape), STANDS_OUT_M
     low, mid = 0.22 * height, 0.36 * height
-    parts.append(
+    return [
         panel(
             (half_l + e, -0.36 * half_w, mid - 0.02),
             (half_l + e, 0.36 * half_w, mid - 0.02),
@@ -204,9 +232,7 @@ def _details(shape: CarShape, fine: bool) -> list[Mesh]:
             (half_l + e - 0.012, -0.42 * half_w, lamp_z + 0.03),
             "plastic",
             _BLACK,
-        )
-    )
-    parts.append(
+        ),
         panel(
             (half_l + e, -0.60 * half_w, low - 0.04),
             (half_l + e, 0.60 * half_w, low - 0.04),
@@ -214,10 +240,16 @@ def _details(shape: CarShape, fine: bool) -> list[Mesh]:
             (half_l + e, -0.55 * half_w, low + 0.06),
             "plastic",
             _BLACK,
-        )
-    )
+        ),
+    ]
+
+
+def _plates(shape: CarShape) -> list[Mesh]:
+    """Both plates, and the bumper behind."""
+    half_l, half_w, height = shape.size[0] / 2, shape.size[1] / 2, shape.size[2]
+    mid, e = 0.36 * height, STANDS_OUT_M
     white = (0.62, 0.62, 0.60)
-    parts.append(
+    return [
         panel(
             (half_l + e + 0.006, -0.26, mid - 0.09),
             (half_l + e + 0.006, 0.26, mid - 0.09),
@@ -225,9 +257,7 @@ def _details(shape: CarShape, fine: bool) -> list[Mesh]:
             (half_l + e + 0.006, -0.26, mid + 0.02),
             "plate",
             white,
-        )
-    )
-    parts.append(
+        ),
         panel(
             (-half_l - 0.02, 0.26, mid),
             (-half_l - 0.02, -0.26, mid),
@@ -235,9 +265,7 @@ def _details(shape: CarShape, fine: bool) -> list[Mesh]:
             (-half_l - 0.02, 0.26, mid + 0.11),
             "plate",
             white,
-        )
-    )
-    parts.append(
+        ),
         panel(
             (-half_l - 0.01, -0.78 * half_w, 0.15 * height),
             (-half_l - 0.01, 0.78 * half_w, 0.15 * height),
@@ -245,9 +273,8 @@ def _details(shape: CarShape, fine: bool) -> list[Mesh]:
             (-half_l - 0.01, -0.76 * half_w, 0.24 * height),
             "plastic",
             _BLACK,
-        )
-    )
-    return parts + (_door_lines(shape) if fine else [])
+        ),
+    ]
 
 
 def _door_lines(shape: CarShape) -> list[Mesh]:

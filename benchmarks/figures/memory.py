@@ -1,6 +1,6 @@
 """Draws docs/images/memory.svg: a car that drives behind a parked truck, and a false alarm, with the real memory.
 
-python docs/images/memory.py
+python benchmarks/figures/memory.py
 """
 
 from pathlib import Path
@@ -116,7 +116,8 @@ def main() -> None:
         "<svg xmlns='http://www.w3.org/2000/svg' viewBox='0 0 840 225' font-family='system-ui, sans-serif'>"
         f"<rect width='840' height='225' fill='white'/>{body}</svg>\n"
     )
-    Path(__file__).with_suffix(".svg").write_text(svg, encoding="utf-8")
+    target = Path(__file__).parents[2] / "docs" / "images" / "memory.svg"
+    target.write_text(svg, encoding="utf-8")
 
 
 if __name__ == "__main__":

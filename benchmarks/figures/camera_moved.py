@@ -1,7 +1,7 @@
 """The two pictures of docs/camera-moved.md.
 
-    python docs/images/camera_moved.py ap yaw.json docs/images/camera-moved-ap.png
-    python docs/images/camera_moved.py knock KITTI_TRACKING docs/images/camera-moved-knock.png
+    python benchmarks/figures/camera_moved.py ap yaw.json docs/images/camera-moved-ap.png
+    python benchmarks/figures/camera_moved.py knock KITTI_TRACKING docs/images/camera-moved-knock.png
 
 ``ap`` draws tables that ``benchmarks/calibration_watch.py --json`` wrote (several, joined by commas). ``knock`` streams
 a drive of KITTI layout whose camera is knocked by half a degree in the middle, and back, past the watch.
