@@ -3,9 +3,11 @@
 ``six lenses`` stand where the pinhole cameras do and see as far to the sides; ``four of 190 degrees`` look around the
 car with overlap, with the same pixels an angle in the middle. The LiDAR branch is the labels
 disturbed (a fifth missed, false boxes added), the same for both; the camera branch is what a perfect detector sees in
-the rendered images, or with ``--boxes`` the projections of the labels, disturbed alike.
+the rendered images, with ``--boxes`` the projections of the labels, disturbed alike, or with ``--network`` what the
+shipped camera network finds in the rendered images of one KITTI camera, without a lens and with one.
 
 python benchmarks/fisheye.py --frames 200 --boxes
+python benchmarks/fisheye.py --frames 12 --network
 python benchmarks/fisheye.py --frames 1 --picture docs/images/fisheye.jpg
 """
 
@@ -19,6 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from lcf3d import Camera, Detections2D, Detections3D, Distortion, FusionConfig, LateCascadeFusion
+from lcf3d.detectors.camera.small import shipped
 from lcf3d.evaluation.center_distance import EvaluationBoxes, class_curves
 from lcf3d.geometry.camera import project_boxes
 from lcf3d.simulation.frames import SimulatedFrame, simulate_frame
@@ -29,11 +32,11 @@ from lcf3d.simulation.presets import (
     get_preset,
     nuscenes_lidar_from_forward,
 )
-from lcf3d.structures import NUSCENES_CLASSES
+from lcf3d.structures import KITTI_CLASSES, NUSCENES_CLASSES
 
 DISTANCES = (0.5, 1.0, 2.0, 4.0)
 LEAST_PX = 10
-CLASSES = ("car", "truck", "bus", "pedestrian", "motorcycle", "bicycle")
+CLASSES = ("car", "truck", "bus", "pedestrian", "motorcycle", "bicycle", *KITTI_CLASSES)
 MOUNTS = (
     ("front", (1.72, 0.0, 1.5), 0.0),
     ("right", (0.8, -0.6, 1.5), -90.0),
@@ -80,8 +83,8 @@ def lidar_branch(truth: Detections3D, rng: np.random.Generator) -> Detections3D:
     return Detections3D(
         np.concatenate([boxes, false]),
         np.concatenate([rng.beta(4, 2, len(found)), rng.beta(2, 4, count)]),
-        np.concatenate([found.labels, np.full(count, NUSCENES_CLASSES.index("car"))]),
-        NUSCENES_CLASSES,
+        np.concatenate([found.labels, np.full(count, [n.lower() for n in truth.class_names].index("car"))]),
+        truth.class_names,
     )
 
 
@@ -110,9 +113,9 @@ def table(parts: Sequence[Detections3D]) -> EvaluationBoxes:
 
 def mean_ap(truth: Sequence[Detections3D], found: Sequence[Detections3D]) -> float:
     """Mean AP, as nuScenes has it, of the classes that occur; percent."""
-    own, other = table(truth), table(found)
-    curves = class_curves(own, other, len(NUSCENES_CLASSES), DISTANCES)
-    present = [c for c in np.unique(own.labels) if NUSCENES_CLASSES[c] in CLASSES]
+    own, other, names = table(truth), table(found), truth[0].class_names
+    curves = class_curves(own, other, len(names), DISTANCES)
+    present = [c for c in np.unique(own.labels) if names[c] in CLASSES]
     return 100 * float(np.mean([[x.average_precision(0.1, 0.1) for x in curves[c]] for c in present]))
 
 
@@ -125,6 +128,7 @@ def main() -> None:
     parser.add_argument("--street", help="kind of street; drawn if not given")
     parser.add_argument("--boxes", action="store_true", help="no images: 2D detections from the labels")
     parser.add_argument("--picture", type=Path, help="draw the first frame's front fisheye image here; no other rigs")
+    parser.add_argument("--network", action="store_true", help="2D detections by the shipped network; one KITTI camera")
     arguments = parser.parse_args()
     pinhole = get_preset("nuscenes32").resized(arguments.scale)
     focal = float(pinhole.cameras[0].intrinsics[0, 0])
@@ -135,9 +139,16 @@ def main() -> None:
     }
     if arguments.picture:
         rigs = {"four of 190 degrees": rigs["four of 190 degrees"]}
+    names: tuple[str, ...] = NUSCENES_CLASSES
+    if arguments.network:
+        names, one = KITTI_CLASSES, get_preset("kitti64")
+        one = replace(one, cameras=one.cameras[:1])
+        focal = float(one.cameras[0].intrinsics[0, 0])
+        rigs = {"one pinhole": one, "one lens": replace(one, cameras=with_lenses(one.cameras))}
+        network = shipped("kitti", threads=1)
     truth, lidar_only = [], []
     fused: dict[str, list[Detections3D]] = {name: [] for name in rigs}
-    fusion = LateCascadeFusion(FusionConfig(class_names=NUSCENES_CLASSES))
+    fusion = LateCascadeFusion(FusionConfig(class_names=names))
     for index in range(arguments.frames):
 
         def look(rig: Preset, index: int = index) -> SimulatedFrame:
@@ -150,13 +161,16 @@ def main() -> None:
             frames = {name: look(rig) for name, rig in rigs.items()}
         kept = next(iter(frames.values())).labels
         kept = kept[np.hypot(kept.boxes[:, 0], kept.boxes[:, 1]) < 50]
-        kept = kept[np.isin(kept.labels, [NUSCENES_CLASSES.index(c) for c in CLASSES])]
+        kept = kept[np.isin(kept.labels, [i for i, name in enumerate(names) if name in CLASSES])]
         lidar = lidar_branch(kept, np.random.default_rng([arguments.seed, index, 1]))
         truth.append(kept)
         lidar_only.append(lidar)
         for name, frame in frames.items():
             cameras = {}
             for number, view in enumerate(frame.preset.cameras):
+                if arguments.network:
+                    cameras[view.name] = network([frame.renders[view.name].image])[0]
+                    continue
                 rng = np.random.default_rng([arguments.seed, index, number, 2])
                 seen = projections(kept, view) if arguments.boxes else frame.detections_2d(view.name)
                 found = camera_branch(seen, rng)

@@ -1,4 +1,4 @@
-"""From "my data" to a picture: lines to write and seconds to wait, for eight starting points.
+"""From "my data" to a picture: lines to write and seconds to wait, for the starting points that people have.
 
 Lines are those that somebody writes, imports included: Python, shell commands, and lines of ``sensors.yaml`` to correct
 after ``lcf3d init``. What makes the detections (the detector itself) is not counted. Seconds are of fresh processes,
@@ -77,6 +77,13 @@ SHELL = {
         ["run folder:drive --lidar results:result.pkl --camera results:drive/camera_results --out {out} --pictures"],
         0,
     ),
+    "mmdet3d's preds": (
+        [
+            "run folder:drive --lidar results:preds?classes={classes} --camera results:drive/camera_results "
+            "--out {out} --pictures"
+        ],
+        0,
+    ),
     "bag (MCAP)": (
         [
             "run bag:drive.mcap --lidar topic:/lidar/objects --camera topic:/front/objects --out {out} --pictures",
@@ -122,6 +129,12 @@ def prepare(folder: Path) -> None:
         for i, frame_id in enumerate(dataset.ids)
     ]
     (folder / "result.pkl").write_bytes(pickle.dumps(records))
+    for record in records:
+        # z of mmdet3d's boxes is that of the bottom face
+        boxes = record["boxes_lidar"] - np.array([0, 0, 0.5, 0, 0, 0, 0]) * record["boxes_lidar"][:, 5:6]
+        labels3d = [CLASSES.index(name) for name in record["name"]]
+        found = {"bboxes_3d": boxes.tolist(), "scores_3d": record["score"].tolist(), "labels_3d": labels3d}
+        write_json(folder / "preds" / f"{record['frame_id']}.json", {**found, "box_type_3d": "LiDAR"})
     lidar = dataset.lidar_results(dataset.root / "lidar_results", CLASSES)
     seen = dataset.camera_results(dataset.root / "camera_results", CLASSES)
     write_bag(
@@ -212,7 +225,10 @@ def main() -> None:
             for repeat in range(arguments.repeats + 1):
                 (folder / "pcd/sensors.yaml").unlink(missing_ok=True)
                 out = f"out{len(rows)}_{repeat}"
-                filled = [[part.replace("{out}", out) for part in command] for command in commands]
+                filled = [
+                    [part.replace("{out}", out).replace("{classes}", ",".join(CLASSES)) for part in command]
+                    for command in commands
+                ]
                 times.append(timed(filled, folder))
             # the first fills the compile cache
             wall, cpu = np.median(np.array(times[1:]), axis=0)

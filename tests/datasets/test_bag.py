@@ -231,6 +231,52 @@ def test_memory_does_not_grow_with_the_bag(tmp_path):
     assert peak < 12e6
 
 
+def test_several_roots_are_trees_of_their_own(caplog):
+    tree = TransformTree()
+    at = np.eye(4)
+    at[0, 3] = 2.0
+    tree.add("base", "lidar", at, None)
+    tree.add("map", "drone", at, None)
+    assert tree.root("lidar") == "base"
+    assert tree.root("drone") == "map"
+    with pytest.raises(DatasetError, match=r"no transform leads from frame 'drone' to 'lidar'; frames of the bag"):
+        tree.lookup("lidar", 0.0, "drone", 0.0)
+    # two localizations of one vehicle: the second must not be mixed into the first
+    for second in range(3):
+        for parent, metres in (("odom", float(second)), ("world", 1000.0)):
+            pose = np.eye(4)
+            pose[0, 3] = metres
+            tree.add(parent, "base", pose, second + (0.01 if parent == "world" else 0.0))
+    assert tree.root("lidar") == "odom"
+    assert tree.root_from("lidar", 1.2)[0, 3] == pytest.approx(3.2)
+    said = [record.getMessage() for record in caplog.records]
+    assert said == ["frame base hangs below odom and below world; only the first is used"]
+
+
+def test_a_rosbag2_folder_with_mcap_storage(tmp_path):
+    """What ROS 2 writes by default since Iron."""
+    from rosbags.rosbag2 import Reader, StoragePlugin, Writer
+
+    write_bag(moving_frames(3), tmp_path / "sqlite")
+    with (
+        Reader(tmp_path / "sqlite") as reader,
+        Writer(tmp_path / "mcap", version=9, storage_plugin=StoragePlugin.MCAP) as writer,
+    ):
+        ways = {
+            c.id: writer.add_connection(c.topic, c.msgtype, msgdef=c.msgdef.data, rihs01=c.digest)
+            for c in reader.connections
+        }
+        for connection, stamp, raw in reader.messages():
+            writer.write(ways[connection.id], stamp, raw)
+    assert list((tmp_path / "mcap").glob("*.mcap"))
+    first, second = BagDataset(tmp_path / "sqlite"), BagDataset(tmp_path / "mcap")
+    assert first.ids == second.ids
+    for a, b in zip(first, second, strict=True):
+        assert np.array_equal(a.points, b.points)
+        assert np.array_equal(a.images["front"], b.images["front"])
+    assert len(second.ids) == 3
+
+
 @pytest.mark.parametrize("name", FORMS)
 def test_a_bag_that_is_cut_off(tmp_path, name):
     write_bag(moving_frames(3), tmp_path / name)

@@ -76,6 +76,32 @@ def test_frame_without_sensor_files(root):
     assert (frame.cameras[0].width, frame.cameras[0].height) == SIZE
 
 
+@pytest.mark.parametrize("place", ["training/calib", "training", "."])
+def test_frames_cut_from_a_raw_drive_share_the_calibration_of_its_day(root, tmp_path, place):
+    from tests.datasets.kitti_drives import make_raw
+
+    own = KittiDataset(root, "val").frame("night_7")
+    day = make_raw(tmp_path / "raw") / "2011_09_26"
+    for file in (root / "training/calib").iterdir():
+        file.unlink()
+    with pytest.raises(Lcf3dError, match="lacks 3 of 3 frames"):
+        KittiDataset(root, "val").require_complete(("000000", "000001", "night_7"))
+    for name in ("calib_cam_to_cam.txt", "calib_velo_to_cam.txt"):
+        (day / name).rename(root / place / name)
+    for path in (root / "training/image_2").iterdir():
+        path.unlink()
+    dataset = KittiDataset(root, "val")
+    dataset.require_complete(dataset.ids)
+    frame = dataset.frame("night_7")
+    np.testing.assert_allclose(frame.cameras[0].pixels_from_lidar, own.cameras[0].pixels_from_lidar, atol=1e-4)
+    # S_rect_02 tells the size where there is no image
+    assert (frame.cameras[0].width, frame.cameras[0].height) == SIZE
+    assert KittiDataset(root).ids == dataset.ids
+    (root / place / "calib_velo_to_cam.txt").unlink()
+    with pytest.raises(Lcf3dError, match=r"calib_velo_to_cam\.txt does not exist"):
+        KittiDataset(root, "val").frame("night_7")
+
+
 def test_tracking_spelling_of_the_calibration(tmp_path):
     from tests.datasets.kitti_folder import calibration_text
 

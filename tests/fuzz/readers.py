@@ -6,33 +6,17 @@ import json
 import pickle
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from lcf3d.structures import KITTI_CLASSES, NUSCENES_CLASSES, Detections2D, Detections3D
 from tests.datasets.kitti_folder import calibration_text
-from tests.fuzz.mutations import Mutation, mutate_bytes, mutate_json
-
-
-class Reader(NamedTuple):
-    """A reader.
-
-    Attributes:
-        file: name of its file, below the folder it works in.
-        make: writes a good file.
-        read: reads it; may raise nothing but lcf3d's errors.
-        mutate: damages it.
-    """
-
-    file: str
-    make: Callable[[Path], None]
-    read: Callable[[Path], Any]
-    mutate: Mutation
-
+from tests.fuzz.binary_readers import BINARY_READERS
+from tests.fuzz.mutations import mutate_bytes, mutate_json
+from tests.fuzz.reader import BOXES, Reader, call
 
 LABEL = "Car 0.00 0 -1.57 100.0 120.0 200.0 180.0 1.5 1.6 3.9 1.0 1.5 20.0 -1.6"
-BOXES = [[10.0, 1.0, -0.8, 4.0, 1.7, 1.5, 0.1], [20.0, -3.0, -0.8, 4.0, 1.7, 1.5, 0.1]]
 
 
 def _text(text: str) -> Callable[[Path], None]:
@@ -143,14 +127,6 @@ def _world_table(name: str) -> Reader:
     return Reader(f"world/v1.0-mini/{name}.json", _world, _tables, mutate_json)
 
 
-def _call(where: str, *arguments: Any) -> Callable[[Path], Any]:
-    """A function of the library by ``module:name``, called with the path and the arguments."""
-    from importlib import import_module
-
-    module, _, name = where.partition(":")
-    return lambda path: getattr(import_module(module), name)(path, *arguments)
-
-
 def _config(path: Path) -> None:
     from lcf3d.fusion.config import FusionConfig
 
@@ -209,7 +185,7 @@ def _plain(dimensions: int) -> Reader:
     boxes = BOXES if dimensions == 3 else [[1.0, 2, 30, 40], [3, 4, 50, 60]]
     one = {"class_names": ["Car", "Pedestrian"], "boxes": boxes, "scores": [0.9, 0.2], "labels": [0, 1]}
     value = one if dimensions == 3 else {"left": one}
-    return Reader("a.json", _json(value), _call(f"lcf3d.formats.plain:read_detections_{dimensions}d"), mutate_json)
+    return Reader("a.json", _json(value), call(f"lcf3d.formats.plain:read_detections_{dimensions}d"), mutate_json)
 
 
 SUBMISSION = {
@@ -238,46 +214,44 @@ OXTS = " ".join(["49.0", "8.4", "112.0", *["0.1"] * 27])
 
 READERS: dict[str, Reader] = {
     "kitti labels": Reader(
-        "a.txt", _text(f"{LABEL}\n" * 3), _call("lcf3d.formats.kitti:read_objects", False), mutate_bytes
+        "a.txt", _text(f"{LABEL}\n" * 3), call("lcf3d.formats.kitti:read_objects", False), mutate_bytes
     ),
     "kitti results": Reader(
-        "a.txt", _text(f"{LABEL} 0.9\n" * 3), _call("lcf3d.formats.kitti:read_objects", True), mutate_bytes
+        "a.txt", _text(f"{LABEL} 0.9\n" * 3), call("lcf3d.formats.kitti:read_objects", True), mutate_bytes
     ),
     "kitti tracking": Reader(
-        "a.txt", _text(f"0 1 {LABEL}\n" * 3), _call("lcf3d.formats.kitti_drives:read_tracking_labels"), mutate_bytes
+        "a.txt", _text(f"0 1 {LABEL}\n" * 3), call("lcf3d.formats.kitti_drives:read_tracking_labels"), mutate_bytes
     ),
     "kitti calibration": Reader(
-        "a.txt", _text(calibration_text()), _call("lcf3d.datasets.kitti_calibration:read_calibration"), mutate_bytes
+        "a.txt", _text(calibration_text()), call("lcf3d.datasets.kitti_calibration:read_calibration"), mutate_bytes
     ),
-    "kitti split": Reader(
-        "a.txt", _text("000001\n000002\n"), _call("lcf3d.formats.kitti:read_frame_ids"), mutate_bytes
-    ),
+    "kitti split": Reader("a.txt", _text("000001\n000002\n"), call("lcf3d.formats.kitti:read_frame_ids"), mutate_bytes),
     "kitti scan": Reader(
         "a.bin",
         lambda path: np.random.default_rng(0).random((300, 4), dtype=np.float32).tofile(path),
-        _call("lcf3d.datasets.kitti:read_points"),
+        call("lcf3d.datasets.kitti:read_points"),
         mutate_bytes,
     ),
     "npy scan": Reader(
         "a.npy",
         lambda path: np.save(path, np.random.default_rng(0).random((300, 4), dtype=np.float32)),
-        _call("lcf3d.datasets.kitti:read_points"),
+        call("lcf3d.datasets.kitti:read_points"),
         mutate_bytes,
     ),
-    "oxts": Reader("a.txt", _text(OXTS), _call("lcf3d.formats.kitti_drives:read_oxts"), mutate_bytes),
+    "oxts": Reader("a.txt", _text(OXTS), call("lcf3d.formats.kitti_drives:read_oxts"), mutate_bytes),
     "times": Reader(
         "a.txt",
         _text("2011-09-26 13:02:25.964389445\n0.1\n"),
-        _call("lcf3d.formats.kitti_drives:read_times"),
+        call("lcf3d.formats.kitti_drives:read_times"),
         mutate_bytes,
     ),
-    "poses": Reader("a.txt", _text("1 " * 12), _call("lcf3d.formats.kitti_drives:read_camera_poses"), mutate_bytes),
+    "poses": Reader("a.txt", _text("1 " * 12), call("lcf3d.formats.kitti_drives:read_camera_poses"), mutate_bytes),
     "coco results": Reader("a.json", _coco, _read_coco, mutate_json),
     "coco index": Reader("a.json", _json(COCO_INDEX), _read_index, mutate_json),
     "camera list": Reader(
-        "a.json", _json(CAMERA_LIST), _call("lcf3d.formats.coco:read_camera_detections", NUSCENES_CLASSES), mutate_json
+        "a.json", _json(CAMERA_LIST), call("lcf3d.formats.coco:read_camera_detections", NUSCENES_CLASSES), mutate_json
     ),
-    "submission": Reader("a.json", _json(SUBMISSION), _call("lcf3d.formats.nuscenes:read_submission"), mutate_json),
+    "submission": Reader("a.json", _json(SUBMISSION), call("lcf3d.formats.nuscenes:read_submission"), mutate_json),
     "plain 3d": _plain(3),
     "plain 2d": _plain(2),
     "provenance": Reader("run/provenance/f.json", _provenance, _read_provenance, mutate_json),
@@ -286,9 +260,9 @@ READERS: dict[str, Reader] = {
     "--set": Reader("a.txt", _text("match_iou=0.3\nunmatched=drop\nclass_names=[Car]\n"), _set, mutate_bytes),
     "score calibration": Reader("a.json", _json({"version": 1, "lidar": {"Car": MAP}}), _calibration, mutate_json),
     "class names": Reader("a.txt", _text("Car\nPedestrian\n"), _classes, mutate_bytes),
-    "image": Reader("a.png", _png, _call("lcf3d.datasets.images:read_image"), mutate_bytes),
-    "image size": Reader("a.png", _png, _call("lcf3d.datasets.images:image_size"), mutate_bytes),
-    "training sample": Reader("a.npz", _npz, _call("lcf3d.training.samples:read_image"), mutate_bytes),
+    "image": Reader("a.png", _png, call("lcf3d.datasets.images:read_image"), mutate_bytes),
+    "image size": Reader("a.png", _png, call("lcf3d.datasets.images:image_size"), mutate_bytes),
+    "training sample": Reader("a.npz", _npz, call("lcf3d.training.samples:read_image"), mutate_bytes),
     "openpcdet": Reader("a.pkl", _pickle, _foreign, mutate_bytes),
     "mmdet3d": Reader("000001.json", _json(MMDET3D), _mmdet3d, mutate_json),
     "localizer": Reader("a.json", _good_spec, _spec, mutate_json),
@@ -296,4 +270,5 @@ READERS: dict[str, Reader] = {
         f"nuscenes {name}": _world_table(name)
         for name in ("sample", "sample_data", "sample_annotation", "calibrated_sensor", "ego_pose", "sensor", "scene")
     },
+    **BINARY_READERS,
 }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from bisect import bisect_left
 
 import numpy as np
@@ -9,6 +10,8 @@ import numpy as np
 from lcf3d.errors import DatasetError
 from lcf3d.geometry.rotation import interpolated, invert_rigid
 from lcf3d.structures import FloatArray
+
+log = logging.getLogger(__name__)
 
 STALE_S = 0.5
 """Transforms that move are not used at moments farther from them than this."""
@@ -19,14 +22,24 @@ class TransformTree:
 
     def __init__(self) -> None:
         self._parents: dict[str, str] = {}
+        self._left_out: set[tuple[str, str]] = set()
         self._static: dict[str, FloatArray] = {}
         self._times: dict[str, list[float]] = {}
         self._poses: dict[str, list[FloatArray]] = {}
 
     def add(self, parent: str, child: str, parent_from_child: FloatArray, time: float | None) -> None:
-        """Take in a transform, of a moment or (None) for good."""
+        """Take in a transform, of a moment or (None) for good.
+
+        A frame has one parent, the first that is heard of: two localizations (``odom`` and ``map`` both above
+        ``base_link``) are two drives, whose poses must not be mixed. What is left out is said once a frame.
+        """
         parent, child = parent.lstrip("/"), child.lstrip("/")
-        self._parents[child] = parent
+        first = self._parents.setdefault(child, parent)
+        if parent != first:
+            if (child, parent) not in self._left_out:
+                self._left_out.add((child, parent))
+                log.warning("frame %s hangs below %s and below %s; only the first is used", child, first, parent)
+            return
         if time is None:
             self._static[child] = parent_from_child
             return

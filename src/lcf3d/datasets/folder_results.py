@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+
+import numpy as np
 
 from lcf3d.datasets.base import CameraSource, LidarSource
 from lcf3d.datasets.kitti_results import KittiCameraResults, KittiLidarResults
 from lcf3d.datasets.plain_results import PlainCameraResults, PlainLidarResults
+from lcf3d.detectors.joins import LeftOut, join_cameras
 from lcf3d.errors import DatasetError, FormatError
-from lcf3d.files import read_json
+from lcf3d.files import is_hidden, list_files, read_json
 from lcf3d.formats.coco import (
     CameraDetections,
     read_camera_detections,
@@ -113,46 +116,91 @@ class FolderLabels:
         return self.path / f"{frame_id}{'.txt' if self.form == KITTI else '.json'}"
 
 
-class _Table3D:
-    """3D detections of a parquet table."""
+class _Counted:
+    """Detections of one file, of which is counted what is left out.
 
-    def __init__(self, path: Path, class_names: Sequence[str], missing: str) -> None:
-        self.path, self.missing = path, missing
+    Args:
+        path: the file.
+        class_names: classes that were asked for.
+        left_out: what reading the file left out.
+    """
+
+    def __init__(self, path: Path, class_names: Sequence[str], left_out: LeftOut) -> None:
+        self.path = path
         self.class_names = tuple(class_names)
-        self._found = read_table_3d(path, class_names)
+        self.camera_names: tuple[str, ...] = ()
+        self.left_out = self._read = left_out
 
-    def load(self, frame_ids: Sequence[str]) -> None:
-        """See that the table has these frames.
+    def _count(self, frame_ids: Sequence[str], found: Iterable[tuple[str, str, Detections2D | Detections3D]]) -> None:
+        """Take stock of (frame id, camera or empty, detections).
 
         Raises:
-            DatasetError: it has none of them. A frame without a row is one without detections.
+            DatasetError: the file has none of the frames, or nothing in it fits.
         """
-        if frame_ids and not any(frame_id in self._found for frame_id in frame_ids):
-            first = next(iter(self._found), None)
+        wanted = set(frame_ids)
+        counted = LeftOut(self.path, classes=Counter(self._read.classes), frames=Counter(self._read.frames))
+        first, met = None, False
+        for frame_id, camera, one in found:
+            first, met = first or frame_id, met or frame_id in wanted
+            if frame_id not in wanted:
+                counted.frames[frame_id] += len(one)
+            elif camera and self.camera_names and camera not in self.camera_names:
+                counted.cameras[camera] += len(one)
+            else:
+                counted.taken += len(one)
+                counted.seen.update(self.class_names[label] for label in np.unique(one.labels).tolist())
+        if frame_ids and not met:
             raise DatasetError(f"{self.path} has none of the {len(frame_ids)} frames; its first is {first!r}")
+        counted.frames = +counted.frames
+        self.left_out = counted
+        counted.require_some(self.class_names, self.camera_names)
+
+
+class _Table3D(_Counted):
+    """3D detections of a parquet table; a frame without a row is one without detections."""
+
+    def __init__(self, path: Path, class_names: Sequence[str]) -> None:
+        super().__init__(path, class_names, LeftOut(path))
+        self._found = read_table_3d(path, class_names, self.left_out)
+
+    def load(self, frame_ids: Sequence[str]) -> None:
+        """See that the table has some of these frames, and count the rest.
+
+        Raises:
+            DatasetError: it has none of them, or nothing in it fits.
+        """
+        self._count(frame_ids, ((frame_id, "", found) for frame_id, found in self._found.items()))
 
     def detect(self, frame: Frame) -> Detections3D:
         """The detections of one frame."""
         return self._found.get(frame.id, Detections3D.empty(self.class_names))
 
 
-class _ByCamera:
+class _ByCamera(_Counted):
     """2D detections by (frame, camera)."""
 
-    def __init__(self, path: Path, found: CameraDetections, class_names: Sequence[str]) -> None:
-        self.path, self._found = path, found
+    def __init__(
+        self,
+        path: Path,
+        found: CameraDetections,
+        class_names: Sequence[str],
+        camera_names: Sequence[str],
+        left_out: LeftOut,
+    ) -> None:
+        super().__init__(path, class_names, left_out)
+        self.camera_names = tuple(camera_names)
+        own = {camera for _, camera in found}
+        joined = {name: name for name in own} | join_cameras(own, camera_names)
+        self._found = {(frame_id, joined[camera]): one for (frame_id, camera), one in found.items()}
         self._empty = Detections2D.empty(class_names)
 
     def load(self, frame_ids: Sequence[str]) -> None:
-        """See that there are results of these frames.
+        """See that there are results of these frames, and count the rest.
 
         Raises:
-            DatasetError: there are none of any.
+            DatasetError: there are none of any, or nothing fits.
         """
-        present = {frame_id for frame_id, _ in self._found}
-        if frame_ids and not present & set(frame_ids):
-            first = next(iter(sorted(present)), None)
-            raise DatasetError(f"{self.path} has none of the {len(frame_ids)} frames; its first is {first!r}")
+        self._count(frame_ids, ((frame_id, camera, one) for (frame_id, camera), one in self._found.items()))
 
     def sees(self, frame: Frame, camera: str) -> bool:
         """Always: a camera without detections looked and saw nothing."""
@@ -164,13 +212,31 @@ class _ByCamera:
 
 
 class _Cameras:
-    """A folder of KITTI text a camera."""
+    """A folder of KITTI text a camera; folders of no camera are counted by their files."""
 
-    def __init__(self, path: Path, class_names: Sequence[str], missing: str) -> None:
-        self._sources = {
-            child.name: KittiCameraResults(child, class_names, missing) for child in path.iterdir() if child.is_dir()
-        }
+    def __init__(self, path: Path, class_names: Sequence[str], missing: str, camera_names: Sequence[str]) -> None:
+        folders = {child.name: child for child in path.iterdir() if child.is_dir() and not is_hidden(child)}
+        joined = join_cameras(folders, camera_names) if camera_names else {name: name for name in folders}
+        if not joined:
+            raise DatasetError(
+                f"{path} holds folders {', '.join(sorted(folders))}, of which none is a camera; expected "
+                f"{', '.join(camera_names)}"
+            )
+        self.path = path
+        self._sources = {joined[n]: KittiCameraResults(folders[n], class_names, missing) for n in joined}
+        self._others = Counter({n: len(list_files(folder, ".txt")) for n, folder in folders.items() if n not in joined})
         self._empty = Detections2D.empty(class_names)
+
+    @property
+    def left_out(self) -> LeftOut:
+        """What the folders of all cameras hold that is not taken."""
+        whole = LeftOut(self.path, cameras=Counter(self._others))
+        for source in self._sources.values():
+            whole.taken += source.left_out.taken
+            whole.classes += source.left_out.classes
+            whole.frames += source.left_out.frames
+            whole.seen |= source.left_out.seen
+        return whole
 
     def load(self, frame_ids: Sequence[str]) -> None:
         """Read the files of these frames."""
@@ -197,7 +263,7 @@ def folder_lidar_results(path: Path, class_names: Sequence[str], missing: str = 
     if form == KITTI:
         return KittiLidarResults(path, class_names, missing)
     if form == TABLE:
-        return _Table3D(path, class_names, missing)
+        return _Table3D(path, class_names)
     if form == PLAIN:
         return PlainLidarResults(path, class_names, missing)
     raise DatasetError(f"{path} holds {form}, which has no 3D boxes: pass it as the camera branch")
@@ -224,9 +290,9 @@ def folder_camera_results(
         FormatError: malformed; names the file.
     """
     form = form_of(path)
-    if form == CAMERAS:
-        return _Cameras(path, class_names, missing)
     names = sorted({camera for _, camera in images.values()})
+    if form == CAMERAS:
+        return _Cameras(path, class_names, missing, names)
     if form == PLAIN:
         return PlainCameraResults(path, class_names, missing, names)
     if form == KITTI:
@@ -236,22 +302,30 @@ def folder_camera_results(
                 "folder of that name in it"
             )
         return KittiCameraResults(path, class_names, missing)
-    found = read_table_2d(path, class_names) if form == TABLE else _read_coco(path, class_names, coco_index, images)
-    return _ByCamera(path, found, class_names)
+    left_out = LeftOut(path)
+    if form == TABLE:
+        found = read_table_2d(path, class_names, left_out)
+    else:
+        found = _read_coco(path, class_names, coco_index, images, left_out)
+    return _ByCamera(path, found, class_names, names, left_out)
 
 
 def _read_coco(
-    path: Path, class_names: Sequence[str], index: Path | None, images: Mapping[str, tuple[str, str]]
+    path: Path,
+    class_names: Sequence[str],
+    index: Path | None,
+    images: Mapping[str, tuple[str, str]],
+    left_out: LeftOut,
 ) -> CameraDetections:
     content = read_json(path)
     if isinstance(content, dict):
-        return read_coco_annotations(path, class_names, images)
+        return read_coco_annotations(path, class_names, images, left_out, content)
     if isinstance(content, list) and content and isinstance(content[0], dict) and "sample_token" in content[0]:
-        return read_camera_detections(path, class_names)
+        return read_camera_detections(path, class_names, left_out, content)
     if index is None:
         raise FormatError(
             f"{path} is a list of COCO results; name the file with its images and categories as coco_index in "
             "sensors.yaml"
         )
     categories, known = read_coco_index(index, images)
-    return read_coco_results(path, class_names, categories, known)
+    return read_coco_results(path, class_names, categories, known, left_out, content)

@@ -1,7 +1,9 @@
 """KITTI object layout: ``ROOT/training/{calib,image_2,image_3,velodyne,label_2}`` and ``ROOT/ImageSets/SPLIT.txt``.
 
-Any subset of the sensor folders may be there. Camera ``left`` is the left colour camera (``image_2``, ``P2``) and
-``right`` the right one (``image_3``, ``P3``). The LiDAR frame is the Velodyne's: x forward, y left, z up already.
+Any subset of the sensor folders may be there. Frames cut from a raw drive may keep the calibration of its day
+(``calib_cam_to_cam.txt`` and ``calib_velo_to_cam.txt`` in ``training/calib``, ``training`` or the root) for all of
+them. Camera ``left`` is the left colour camera (``image_2``, ``P2``) and ``right`` the right one (``image_3``, ``P3``).
+The LiDAR frame is the Velodyne's: x forward, y left, z up already.
 """
 
 from __future__ import annotations
@@ -17,7 +19,15 @@ from numpy.typing import NDArray
 from lcf3d.datasets.base import BaseDataset, CameraSource, LidarSource, ResultWriter, require_folder
 from lcf3d.datasets.check import Finding
 from lcf3d.datasets.images import ImageFiles
-from lcf3d.datasets.kitti_calibration import CAMERAS, KittiCalibration, cameras_of, parse_image_size, read_calibration
+from lcf3d.datasets.kitti_calibration import (
+    CAMERAS,
+    RAW_CAMERAS,
+    KittiCalibration,
+    cameras_of,
+    parse_image_size,
+    read_calibration,
+    read_raw_calibration,
+)
 from lcf3d.datasets.kitti_sequences import FRAMES_PER_S, lidar_pose, sequence_of
 from lcf3d.errors import DatasetError, FormatError
 from lcf3d.files import list_files
@@ -141,7 +151,11 @@ class KittiDataset(KittiLikeDataset):
         there = [part for part in PARTS if (self.root / part).is_dir()] or list(PARTS)
         if self.split is not None and self.split.lower().startswith("test"):
             there.reverse()
-        return max(there, key=lambda part: sum((self.root / part / "calib" / f"{i}.txt").is_file() for i in listed))
+        # frames cut from a raw drive have no calibration files of their own
+        names = ("calib/{}.txt", "velodyne/{}.bin", "image_2/{}.png")
+        return max(
+            there, key=lambda part: sum(any((self.root / part / n.format(i)).is_file() for n in names) for i in listed)
+        )
 
     def _split_path(self, split: str) -> Path:
         path = self.root / "ImageSets" / f"{split}.txt"
@@ -151,10 +165,24 @@ class KittiDataset(KittiLikeDataset):
         return path
 
     def _all_ids(self) -> tuple[str, ...]:
-        ids = tuple(p.stem for p in list_files(self.folder / "calib", ".txt"))
+        ids: tuple[str, ...] = tuple(sorted(self._calibrated))
+        if not ids and self._raw is not None:
+            ids = tuple(sorted({*self._present["velodyne"], *self._present["image_2"]}))
         if not ids:
             raise DatasetError(f"{self.folder / 'calib'} holds no calibration files")
         return ids
+
+    @cached_property
+    def _calibrated(self) -> frozenset[str]:
+        """Frames that have a calibration file of their own."""
+        return frozenset(p.stem for p in list_files(self.folder / "calib", ".txt") if not p.name.startswith("calib_"))
+
+    @cached_property
+    def _raw(self) -> tuple[KittiCalibration, dict[str, tuple[int, int]]] | None:
+        """Calibration and image sizes of the recording day, for the frames that have none of their own."""
+        folders = (self.folder / "calib", self.folder, self.root)
+        found = next((folder for folder in folders if (folder / RAW_CAMERAS).is_file()), None)
+        return None if found is None else read_raw_calibration(found)
 
     @cached_property
     def _present(self) -> dict[str, dict[str, Path]]:
@@ -168,16 +196,17 @@ class KittiDataset(KittiLikeDataset):
         Raises:
             DatasetError: some have none; says how many and which first.
         """
-        present = {p.stem for p in list_files(self.folder / "calib", ".txt")}
-        absent = [frame_id for frame_id in frame_ids if frame_id not in present]
-        if absent:
+        absent = [frame_id for frame_id in frame_ids if frame_id not in self._calibrated]
+        if absent and self._raw is None:
             raise DatasetError(
                 f"{self.folder / 'calib'} lacks {len(absent)} of {len(frame_ids)} frames, first {absent[0]}.txt; "
                 "copy the calibration files or leave those frames out of the split"
             )
 
     def calibration(self, frame_id: str) -> KittiCalibration:
-        """The calibration of a frame."""
+        """The calibration of a frame, or of the recording day where the frame has none of its own."""
+        if self._raw is not None and frame_id not in self._calibrated:
+            return self._raw[0]
         return read_calibration(self.folder / "calib" / f"{frame_id}.txt")
 
     def image_paths(self, frame_id: str) -> dict[str, Path]:
@@ -211,7 +240,7 @@ class KittiDataset(KittiLikeDataset):
         return Frame(
             frame_id,
             points=(lambda: read_points(scan)) if scan else None,
-            cameras=cameras_of(calibration, images, {}, self.default_image_size),
+            cameras=cameras_of(calibration, images, self._raw[1] if self._raw else {}, self.default_image_size),
             images=ImageFiles(images),
             labels=labels if label else None,
             timestamp=None if sequence is None else number / FRAMES_PER_S,

@@ -29,6 +29,10 @@ DEFAULT_IMAGE_SIZE = (1242, 375)
 NEAR_MIDDLE = 0.1
 
 
+RAW_CAMERAS = "calib_cam_to_cam.txt"
+RAW_LIDAR = "calib_velo_to_cam.txt"
+RAW_IMU = "calib_imu_to_velo.txt"
+
 # calibrations that are kept: the files of a drive's frames are alike
 KEPT = 256
 
@@ -70,7 +74,7 @@ _parsed: dict[str, KittiCalibration] = {}
 
 def _parse_calibration(path: Path, text: str) -> KittiCalibration:
     """What the text of the calibration file at ``path`` says."""
-    entries = _parse_entries(path, text, ())
+    entries = _parse_entries(path, text)
     rectification, reference_from_lidar = np.eye(4), np.eye(4)
     if "Tr" in entries:
         # odometry: from the Velodyne to the rectified reference camera at once
@@ -101,14 +105,14 @@ def _parse_calibration(path: Path, text: str) -> KittiCalibration:
 NOT_NUMBERS = ("calib_time", "corner_dist")
 
 
-def read_entries(path: Path, skip: Sequence[str] = ()) -> dict[str, FloatArray]:
-    """The numbers of a calibration file by the name that begins each line, but for the names in ``skip``.
+def read_entries(path: Path) -> dict[str, FloatArray]:
+    """The numbers of a calibration file by the name that begins each line; `NOT_NUMBERS` are passed over.
 
     Raises:
         DatasetError: the file does not exist.
         FormatError: a line is malformed; names it.
     """
-    return _parse_entries(path, _text(path), skip)
+    return _parse_entries(path, _text(path))
 
 
 def _text(path: Path) -> str:
@@ -118,12 +122,12 @@ def _text(path: Path) -> str:
         raise DatasetError(f"calibration file {path} does not exist") from None
 
 
-def _parse_entries(path: Path, text: str, skip: Sequence[str]) -> dict[str, FloatArray]:
+def _parse_entries(path: Path, text: str) -> dict[str, FloatArray]:
     """See `read_entries`."""
     entries: dict[str, FloatArray] = {}
     for number, line in enumerate(text.splitlines(), 1):
         name, *fields = line.replace(":", " ").split() or [""]
-        if name in skip or name in NOT_NUMBERS:
+        if name in NOT_NUMBERS:
             continue
         try:
             entries[name] = np.array([float(f) for f in fields])
@@ -148,6 +152,43 @@ def matrix_entry(
                 raise FormatError(f"{path}: {name} must hold {shape[0] * shape[1]} numbers, got {entries[name].size}")
             return entries[name].reshape(shape)
     raise FormatError(f"{path} has no entry {' or '.join(names)}")
+
+
+def read_raw_calibration(folder: Path) -> tuple[KittiCalibration, dict[str, tuple[int, int]]]:
+    """The calibration of a recording day, and (width, height) of its rectified images by camera name.
+
+    Args:
+        folder: holds ``calib_cam_to_cam.txt``, ``calib_velo_to_cam.txt`` and perhaps ``calib_imu_to_velo.txt``.
+
+    Raises:
+        DatasetError: one of the first two does not exist.
+        FormatError: an entry is missing or malformed; names it.
+    """
+    path = folder / RAW_CAMERAS
+    entries = read_entries(path)
+    rectification = np.eye(4)
+    rectification[:3, :3] = matrix_entry(path, entries, ("R_rect_00",), (3, 3))
+    projections = {
+        f"P{i}": matrix_entry(path, entries, (f"P_rect_0{i}",), (3, 4))
+        for i in range(4)
+        if i == 2 or f"P_rect_0{i}" in entries
+    }
+    sizes = {}
+    for name, key in (("left", "S_rect_02"), ("right", "S_rect_03")):
+        if key in entries:
+            width, height = matrix_entry(path, entries, (key,), (1, 2))[0]
+            sizes[name] = int(width), int(height)
+    lidar_from_imu = _rigid(folder / RAW_IMU) if (folder / RAW_IMU).is_file() else None
+    return KittiCalibration(projections, rectification @ _rigid(folder / RAW_LIDAR), lidar_from_imu), sizes
+
+
+def _rigid(path: Path) -> FloatArray:
+    """(4, 4) transform from the entries ``R`` and ``T`` of a raw drive's calibration file."""
+    entries = read_entries(path)
+    transform = np.eye(4)
+    transform[:3, :3] = matrix_entry(path, entries, ("R",), (3, 3))
+    transform[:3, 3] = matrix_entry(path, entries, ("T",), (1, 3))[0]
+    return transform
 
 
 def _check_image_size(path: Path, size: tuple[int, int], projection: FloatArray) -> None:

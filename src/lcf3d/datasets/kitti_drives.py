@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lcf3d.datasets.kitti_calibration import KittiCalibration, matrix_entry, read_calibration, read_entries
+from lcf3d.datasets.kitti_calibration import KittiCalibration, read_calibration, read_raw_calibration
 from lcf3d.errors import DatasetError
 from lcf3d.files import list_files
 from lcf3d.formats.kitti import KittiObjects, detections_3d
@@ -127,36 +127,16 @@ class RawDrive(Drive):
     @cached_property
     def calibration(self) -> KittiCalibration:
         """From ``calib_cam_to_cam.txt`` and ``calib_velo_to_cam.txt`` (and ``calib_imu_to_velo.txt``)."""
-        path = self.folder.parent / "calib_cam_to_cam.txt"
-        entries = self._camera_entries
-        rectification = np.eye(4)
-        rectification[:3, :3] = matrix_entry(path, entries, ("R_rect_00",), (3, 3))
-        projections = {
-            f"P{i}": matrix_entry(path, entries, (f"P_rect_0{i}",), (3, 4))
-            for i in range(4)
-            if i == 2 or f"P_rect_0{i}" in entries
-        }
-        imu = self.folder.parent / "calib_imu_to_velo.txt"
-        return KittiCalibration(
-            projections,
-            rectification @ _rigid(self.folder.parent / "calib_velo_to_cam.txt"),
-            _rigid(imu) if imu.is_file() else None,
-        )
+        return self._day[0]
 
     @cached_property
     def image_sizes(self) -> Mapping[str, tuple[int, int]]:
         """From the sizes of the rectified images."""
-        path = self.folder.parent / "calib_cam_to_cam.txt"
-        found = {}
-        for name, key in (("left", "S_rect_02"), ("right", "S_rect_03")):
-            if key in self._camera_entries:
-                width, height = matrix_entry(path, self._camera_entries, (key,), (1, 2))[0]
-                found[name] = int(width), int(height)
-        return found
+        return self._day[1]
 
     @cached_property
-    def _camera_entries(self) -> dict[str, FloatArray]:
-        return read_entries(self.folder.parent / "calib_cam_to_cam.txt", skip=("calib_time",))
+    def _day(self) -> tuple[KittiCalibration, dict[str, tuple[int, int]]]:
+        return read_raw_calibration(self.folder.parent)
 
     @cached_property
     def _tracklets(self) -> Tracklets | None:
@@ -278,15 +258,6 @@ def _camera_poses(paths: Iterable[Path], calibration: KittiCalibration) -> dict[
         if path.is_file():
             return dict(enumerate(read_camera_poses(path) @ calibration.camera_from_lidar))
     return {}
-
-
-def _rigid(path: Path) -> FloatArray:
-    """(4, 4) transform from the entries ``R`` and ``T`` of a raw drive's calibration file."""
-    entries = read_entries(path, skip=("calib_time",))
-    transform = np.eye(4)
-    transform[:3, :3] = matrix_entry(path, entries, ("R",), (3, 3))
-    transform[:3, 3] = matrix_entry(path, entries, ("T",), (1, 3))[0]
-    return transform
 
 
 def _by_number(paths: Iterable[Path]) -> dict[int, Path]:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 from lcf3d.detectors.joins import LeftOut, join_cameras, join_classes, require_pixels
 from lcf3d.errors import DatasetError
@@ -13,8 +15,11 @@ from lcf3d.formats.plain import read_detections_2d, read_detections_3d, write_de
 from lcf3d.provenance import FusedDetections
 from lcf3d.structures import Detections2D, Detections3D, Frame
 
+MOST_KEPT = 10_000
+"""Frames whose detections stay in memory from the count of what fits to their use; others are read again."""
 
-class _PlainResults:
+
+class _PlainResults(ABC):
     """A folder of ``ID.json``; a folder written by ``lcf3d run`` (with ``data/``) will do.
 
     Args:
@@ -35,6 +40,11 @@ class _PlainResults:
         self.missing = missing
         self.camera_names: tuple[str, ...] = ()
         self.left_out = LeftOut(self.folder)
+        self._kept: dict[str, Any] = {}
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without what was read: another process reads its own frames."""
+        return {**self.__dict__, "_kept": {}}
 
     def load(self, frame_ids: Sequence[str]) -> None:
         """See that there are results of these frames.
@@ -51,12 +61,26 @@ class _PlainResults:
         missing = set(absent)
         for frame_id in frame_ids:
             if frame_id not in missing:
-                self._count(self._path(frame_id))
+                found = self._parse(self._path(frame_id))
+                self._count(found, self._path(frame_id))
+                if len(self._kept) < MOST_KEPT:
+                    self._kept[frame_id] = found
         self.left_out.require_some(self.class_names, self.camera_names)
 
-    def _count(self, path: Path) -> None:
+    @abstractmethod
+    def _parse(self, path: Path) -> Any:
+        """What a file holds."""
+
+    @abstractmethod
+    def _count(self, found: Any, path: Path) -> None:
         """Note what of a file is taken."""
-        raise NotImplementedError
+
+    def _found(self, frame_id: str) -> Any:
+        """What the file of a frame holds, read once; None where it may be missing."""
+        if frame_id not in self._kept:
+            path = self._file(frame_id)
+            return None if path is None else self._parse(path)
+        return self._kept[frame_id]
 
     def _count_classes(self, found: Detections2D | Detections3D) -> None:
         joined = join_classes(found.class_names, self.class_names)
@@ -82,15 +106,17 @@ class _PlainResults:
 class PlainLidarResults(_PlainResults):
     """3D detections, see `lcf3d.formats.plain`."""
 
-    def _count(self, path: Path) -> None:
-        self._count_classes(read_detections_3d(path))
+    def _parse(self, path: Path) -> Detections3D:
+        return read_detections_3d(path)
+
+    def _count(self, found: Detections3D, path: Path) -> None:
+        self._count_classes(found)
 
     def detect(self, frame: Frame) -> Detections3D:
         """The detections of one frame."""
-        path = self._file(frame.id)
-        if path is None:
+        found: Detections3D | None = self._found(frame.id)
+        if found is None:
             return Detections3D.empty(self.class_names)
-        found = read_detections_3d(path)
         return found.with_classes(self.class_names, join_classes(found.class_names, self.class_names))
 
 
@@ -107,8 +133,10 @@ class PlainCameraResults(_PlainResults):
         super().__init__(folder, class_names, missing)
         self.camera_names = tuple(camera_names)
 
-    def _count(self, path: Path) -> None:
-        found = read_detections_2d(path)
+    def _parse(self, path: Path) -> dict[str, Detections2D]:
+        return read_detections_2d(path)
+
+    def _count(self, found: dict[str, Detections2D], path: Path) -> None:
         joined = join_cameras(found, self.camera_names)
         for camera, one in found.items():
             if camera in joined or not self.camera_names:
@@ -123,8 +151,7 @@ class PlainCameraResults(_PlainResults):
 
     def detect(self, frame: Frame, camera: str) -> Detections2D:
         """The detections of one camera of one frame, clipped to its image."""
-        path = self._file(frame.id)
-        found = read_detections_2d(path) if path is not None else {}
+        found: dict[str, Detections2D] = self._found(frame.id) or {}
         own = next((name for name, target in join_cameras(found, [camera]).items() if target == camera), None)
         if own is None:
             return Detections2D.empty(self.class_names)

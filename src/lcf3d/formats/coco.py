@@ -104,16 +104,18 @@ def pack_counts(runs: Sequence[int]) -> str:
 
 
 def read_camera_detections(
-    path: str | Path, class_names: Sequence[str], left_out: LeftOut | None = None
+    path: str | Path, class_names: Sequence[str], left_out: LeftOut | None = None, content: Any = None
 ) -> CameraDetections:
     """Detections of a simple list (see the module's text) by (sample token, camera), with masks where there are some.
 
-    Classes that are none of ``class_names`` (`lcf3d.detectors.joins`) are left out and counted in ``left_out``.
+    Classes that are none of ``class_names`` (`lcf3d.detectors.joins`) are left out and counted in ``left_out``;
+    ``content`` is that of the file, where it was read already.
 
     Raises:
         FormatError: not such a list; the message names the record.
     """
-    return _group(path, _records(path), lambda r: (str(r["sample_token"]), str(r["camera"])), class_names, left_out)
+    records = _records(path, content)
+    return _group(path, records, lambda r: (str(r["sample_token"]), str(r["camera"])), class_names, left_out)
 
 
 def write_camera_detections(path: str | Path, detections: Mapping[tuple[str, str], Detections2D]) -> None:
@@ -140,6 +142,7 @@ def read_coco_results(
     categories: Mapping[int, str],
     images: Mapping[int | str, tuple[str, str]],
     left_out: LeftOut | None = None,
+    content: Any = None,
 ) -> CameraDetections:
     """Detections of a COCO results file by (frame id, camera), with masks where there are some.
 
@@ -149,11 +152,12 @@ def read_coco_results(
         categories: name by ``category_id`` (`read_coco_index`).
         images: (frame id, camera) by ``image_id`` (`read_coco_index`).
         left_out: counts detections of other classes.
+        content: of the file, where it was read already.
 
     Raises:
         FormatError: not such a file, or it names an image or category that is not known.
     """
-    records = _records(path)
+    records = _records(path, content)
     for i, record in enumerate(records):
         for key, known in (("category_id", categories), ("image_id", images)):
             if key not in record or not isinstance(record[key], int | str) or record[key] not in known:
@@ -165,18 +169,19 @@ def read_coco_results(
 
 
 def read_coco_index(
-    path: Path, frames_of_files: Mapping[str, tuple[str, str]]
+    path: Path, frames_of_files: Mapping[str, tuple[str, str]], content: Any = None
 ) -> tuple[dict[int, str], dict[int | str, tuple[str, str]]]:
     """Names of categories by id, and (frame id, camera) of images by id, of a COCO annotation file.
 
     Args:
         path: JSON with ``categories`` and ``images``.
         frames_of_files: (frame id, camera) by image path; of a file name, as many last parts as tell them apart.
+        content: of the file, where it was read already.
 
     Raises:
         FormatError: not such a file.
     """
-    index = read_json(path)
+    index = read_json(path) if content is None else content
     try:
         categories = {int(record["id"]): str(record["name"]) for record in index["categories"]}
         files = {record["id"]: str(record["file_name"]) for record in index["images"]}
@@ -219,7 +224,11 @@ def _frame_of(name: str, frames: Mapping[str, set[tuple[str, str]]], path: Path)
 
 
 def read_coco_annotations(
-    path: Path, class_names: Sequence[str], frames_of_files: Mapping[str, tuple[str, str]]
+    path: Path,
+    class_names: Sequence[str],
+    frames_of_files: Mapping[str, tuple[str, str]],
+    left_out: LeftOut | None = None,
+    content: Any = None,
 ) -> CameraDetections:
     """2D boxes of a COCO file with ``images``, ``categories`` and ``annotations``; those without a score get 1.
 
@@ -227,26 +236,37 @@ def read_coco_annotations(
         path: the file.
         class_names: classes to keep; others are left out.
         frames_of_files: see `read_coco_index`.
+        left_out: counts detections of other classes, and of images that are none of the dataset's.
+        content: of the file, where it was read already.
 
     Raises:
         FormatError: not such a file, or none of its images is known.
     """
-    categories, images = read_coco_index(path, frames_of_files)
-    records = read_json(path).get("annotations")
+    content = read_json(path) if content is None else content
+    categories, images = read_coco_index(path, frames_of_files, content)
+    records = content.get("annotations")
     if not isinstance(records, list) or not all(isinstance(record, dict) for record in records):
         raise FormatError(f"{path} must hold 'annotations', a list of records")
     if not images:
         raise FormatError(f"{path}: none of its images is one of the {len(frames_of_files)} of the dataset")
-    kept = [record for record in records if record.get("image_id") in images]
+    kept = [record for record in records if _known(record.get("image_id"), images)]
+    if left_out is not None:
+        left_out.frames.update(
+            f"image {shortened(r.get('image_id'))}" for r in records if not _known(r.get("image_id"), images)
+        )
     named = [{"score": 1.0, **r, "category_name": categories.get(r.get("category_id", -1), "")} for r in kept]
     # polygons are no run-length masks
     named = [{k: v for k, v in r.items() if k != "segmentation" or isinstance(v, dict)} for r in named]
     looked_at = {place: Detections2D.empty(class_names) for place in images.values()}
-    return {**looked_at, **_group(path, named, lambda r: images[r["image_id"]], class_names, None)}
+    return {**looked_at, **_group(path, named, lambda r: images[r["image_id"]], class_names, left_out)}
 
 
-def _records(path: str | Path) -> list[dict[str, Any]]:
-    records = read_json(path)
+def _known(image: Any, images: Mapping[int | str, tuple[str, str]]) -> bool:
+    return isinstance(image, int | str) and image in images
+
+
+def _records(path: str | Path, content: Any = None) -> list[dict[str, Any]]:
+    records = read_json(path) if content is None else content
     if not isinstance(records, list) or not all(isinstance(record, dict) for record in records):
         raise FormatError(f"{path} must hold a list of detections, got {type(records).__name__}")
     return records

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lcf3d.errors import FormatError, MissingExtraError
-from lcf3d.files import atomic_path
+from lcf3d.files import atomic_path, reading, require_file, shortened
 from lcf3d.remote.places import fetched
 
 TEXT = np.dtype(object)
@@ -31,8 +31,11 @@ def read_columns(path: Path, columns: Mapping[str, Any], optional: tuple[str, ..
         MissingExtraError: pyarrow is not installed.
     """
     arrow = _arrow("reading feather files")
+    if not fetched(path).exists():
+        raise FormatError(f"{path} does not exist")
+    require_file(path)
     try:
-        with arrow.OSFile(str(fetched(path))) as file:
+        with reading(path, "a feather file"), arrow.OSFile(str(path)) as file:
             present = arrow.ipc.open_file(file).schema.names
             absent = [name for name in columns if name not in present and name not in optional]
             if absent:
@@ -42,11 +45,12 @@ def read_columns(path: Path, columns: Mapping[str, Any], optional: tuple[str, ..
             wanted = [i for i, name in enumerate(present) if name in columns]
             options = arrow.ipc.IpcReadOptions(included_fields=wanted)
             table = arrow.ipc.open_file(file, options=options).read_all()
-    except FileNotFoundError:
-        raise FormatError(f"{path} does not exist") from None
-    except (arrow.ArrowInvalid, OSError) as error:
-        raise FormatError(f"{path} cannot be read as a feather file ({str(error).splitlines()[0]})") from None
-    return {name: _column(path, table, name, kind) for name, kind in columns.items() if name in present}
+            # what is damaged would be read beyond its end
+            table.validate(full=True)
+    except OSError as error:
+        raise FormatError(f"{path} cannot be read as a feather file ({shortened(error)})") from None
+    with reading(path, "a feather file"):
+        return {name: _column(path, table, name, kind) for name, kind in columns.items() if name in present}
 
 
 def write_columns(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
@@ -74,7 +78,8 @@ def _column(path: Path, table: Any, name: str, kind: Any) -> NDArray[Any]:
         raise FormatError(f"{path}: column {name} must hold {'text' if wanted == TEXT else 'numbers'}")
     if wanted.kind in "iu" and values.dtype.kind == "f":
         raise FormatError(f"{path}: column {name} must hold whole numbers, got {column.type}")
-    return np.asarray(values).astype(wanted)
+    with np.errstate(all="ignore"):
+        return np.asarray(values).astype(wanted)
 
 
 def _arrow(purpose: str) -> Any:

@@ -6,12 +6,13 @@ The schema, version `SCHEMA`, is in docs/fleet.md. Numbers are exact, where the 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 from lcf3d.errors import ConfigError, FormatError
-from lcf3d.files import atomic_path
+from lcf3d.files import atomic_path, reading, shortened
 from lcf3d.provenance import REAL, WHOLE, Decisions, FusedDetections, TrackTable
 from lcf3d.remote.places import fetched
 
@@ -114,7 +115,9 @@ def read_frame_ids(path: Path) -> list[str]:
     Raises:
         FormatError: not such a table, or of another version.
     """
-    ids: list[str] = _open(path).read(columns=["frame"]).column("frame").to_pylist()
+    file = _open(path)
+    with _table(path):
+        ids: list[str] = file.read(columns=["frame"]).column("frame").to_pylist()
     return ids
 
 
@@ -124,26 +127,41 @@ def read_frames(path: Path) -> Iterator[tuple[str, FusedDetections]]:
     Raises:
         FormatError: not such a table, or of another version.
     """
-    for batch in _open(path).iter_batches(batch_size=64):
-        for row in batch.to_pylist():
-            yield row["frame"], _from_row(row)
+    file = _open(path)
+    with _table(path):
+        for batch in file.iter_batches(batch_size=64):
+            # what is damaged would be read beyond its end
+            batch.validate(full=True)
+            for row in batch.to_pylist():
+                yield row["frame"], _from_row(row)
+
+
+@contextmanager
+def _table(path: Path) -> Iterator[None]:
+    """Errors in the table's content as one sentence."""
+    try:
+        with reading(path, "a table of fused frames"):
+            yield
+    except OSError as error:
+        raise FormatError(f"{path} cannot be read as a table of fused frames ({shortened(error)})") from None
 
 
 def _open(path: Path) -> Any:
     pa = arrow()
     try:
-        file = pa.parquet.ParquetFile(fetched(path))
+        with reading(path, "a parquet file"):
+            file = pa.parquet.ParquetFile(fetched(path))
+            version = (file.schema_arrow.metadata or {}).get(_KEY)
     except FileNotFoundError:
         raise FormatError(f"{path} does not exist") from None
-    except (pa.ArrowInvalid, OSError) as error:
-        raise FormatError(f"{path} is no parquet file ({error})") from None
-    version = (file.schema_arrow.metadata or {}).get(_KEY)
+    except OSError as error:
+        raise FormatError(f"{path} is no parquet file ({shortened(error)})") from None
     if version is None:
         raise FormatError(f"{path} was not written by lcf3d: it has no schema version")
     if version != SCHEMA.encode():
         raise FormatError(
-            f"{path} has schema {version.decode(errors='replace')}, this lcf3d reads {SCHEMA}: upgrade it, or write "
-            "the run again"
+            f"{path} has schema {shortened(version.decode(errors='replace'))}, this lcf3d reads {SCHEMA}: upgrade it, "
+            "or write the run again"
         )
     return file
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from lcf3d.errors import FormatError
+from lcf3d.files import read_bytes, shortened
 
 # modules moved in numpy 2; what a pickled array or scalar names
 _NUMPY = {
@@ -58,10 +59,11 @@ def read_arrays(path: Path) -> Any:
     Raises:
         FormatError: the file is absent, damaged, or names any other class or function, none of which is run.
     """
+    if not path.exists():
+        raise FormatError(f"{path} does not exist")
+    raw = read_bytes(path)
     try:
-        return _ArraysOnly(io.BytesIO(path.read_bytes())).load()
-    except FileNotFoundError:
-        raise FormatError(f"{path} does not exist") from None
+        return _ArraysOnly(io.BytesIO(raw)).load()
     except pickle.UnpicklingError as error:
         reason = str(error)
         if reason.startswith("names "):
@@ -72,4 +74,6 @@ def read_arrays(path: Path) -> Any:
         raise FormatError(f"{path} is no pickle file, or a damaged one ({reason})") from None
     except Exception as error:
         # the unpickler raises many kinds on torn files
-        raise FormatError(f"{path} is no pickle file, or a damaged one ({type(error).__name__}: {error})") from None
+        raise FormatError(
+            f"{path} is no pickle file, or a damaged one ({shortened(f'{type(error).__name__}: {error}')})"
+        ) from None

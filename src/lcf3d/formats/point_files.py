@@ -13,7 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lcf3d.errors import DatasetError, FormatError, MissingExtraError
+from lcf3d.errors import FormatError, MissingExtraError
+from lcf3d.files import reading, shortened
+from lcf3d.formats.scans import npy_array, require_bare, scan_bytes
 
 SUFFIXES = (".bin", ".npy", ".pcd", ".ply", ".las", ".laz")
 INTENSITY = ("intensity", "i", "reflectance", "reflectivity", "remission", "scalar_intensity", "intensities")
@@ -41,12 +43,11 @@ def read_scan(path: Path, columns: Sequence[str] = ("x", "y", "z", "intensity"))
         FormatError: it cannot be read as such a scan, has no x, y or z, or numbers that no scanner measures.
         MissingExtraError: the library that reads it is not installed.
     """
-    if not path.is_file():
-        raise DatasetError(f"scan {path} does not exist")
+    raw = scan_bytes(path)
     suffix = path.suffix.lower()
     if suffix not in _READERS:
         raise FormatError(f"{path} is no scan of a known kind; expected one of {', '.join(SUFFIXES)}")
-    return points_of(_READERS[suffix](path, tuple(columns)), str(path))
+    return points_of(_READERS[suffix](path, raw, tuple(columns)), str(path))
 
 
 def points_of(fields: Mapping[str, NDArray[Any]], place: str) -> NDArray[np.float32]:
@@ -60,7 +61,8 @@ def points_of(fields: Mapping[str, NDArray[Any]], place: str) -> NDArray[np.floa
     if absent:
         raise FormatError(f"{place} has no column {', '.join(absent)}; it holds {', '.join(fields) or 'none'}")
     intensity = next((named[name] for name in INTENSITY if name in named), np.zeros(len(named["x"])))
-    points = np.stack([np.asarray(v, dtype=np.float32) for v in (*(named[n] for n in "xyz"), intensity)], axis=1)
+    with reading(place, "a scan of numbers"), np.errstate(all="ignore"):
+        points = np.stack([np.asarray(v, dtype=np.float32) for v in (*(named[n] for n in "xyz"), intensity)], axis=1)
     points = points[np.isfinite(points[:, :3]).all(axis=1)]
     points[~np.isfinite(points[:, 3]), 3] = 0
     sizes = np.abs(points[:, :3])
@@ -79,7 +81,9 @@ def column_count(path: Path) -> int:
     Raises:
         FormatError: no such number fits the file.
     """
-    values = np.fromfile(path, dtype="<f4")
+    raw = scan_bytes(path)
+    require_bare(path, raw, 4)
+    values = np.frombuffer(raw[: len(raw) // 4 * 4], dtype="<f4")
     best, found = np.inf, 0
     for count in (4, 5, 6, 3):
         if not len(values) or len(values) % count:
@@ -96,23 +100,20 @@ def column_count(path: Path) -> int:
     return found
 
 
-def _read_bin(path: Path, columns: Sequence[str]) -> dict[str, NDArray[Any]]:
+def _read_bin(path: Path, raw: bytes, columns: Sequence[str]) -> dict[str, NDArray[Any]]:
+    require_bare(path, raw, len(columns))
     size = 4 * len(columns)
-    length = path.stat().st_size
-    if length % size:
+    if len(raw) % size:
         raise FormatError(
-            f"{path} is cut off, or its columns are others than {', '.join(columns)}: {length} bytes are no whole "
+            f"{path} is cut off, or its columns are others than {', '.join(columns)}: {len(raw)} bytes are no whole "
             f"number of {size}-byte points"
         )
-    table = np.fromfile(path, dtype="<f4").reshape(-1, len(columns))
+    table = np.frombuffer(raw, dtype="<f4").reshape(-1, len(columns))
     return {name: table[:, i] for i, name in enumerate(columns)}
 
 
-def _read_npy(path: Path, columns: Sequence[str]) -> dict[str, NDArray[Any]]:
-    try:
-        table = np.load(path, allow_pickle=False)
-    except (ValueError, EOFError, OSError) as error:
-        raise FormatError(f"{path} cannot be read as a NumPy array ({str(error).splitlines()[0]})") from None
+def _read_npy(path: Path, raw: bytes, columns: Sequence[str]) -> dict[str, NDArray[Any]]:
+    table = npy_array(path, raw)
     if table.dtype.names:
         return {name: table[name].reshape(-1) for name in table.dtype.names}
     if table.ndim != 2 or table.shape[1] < 3:
@@ -120,7 +121,7 @@ def _read_npy(path: Path, columns: Sequence[str]) -> dict[str, NDArray[Any]]:
     return {name: table[:, i] for i, name in enumerate(columns[: table.shape[1]])}
 
 
-def _read_pcd(path: Path, columns: Sequence[str]) -> dict[str, NDArray[Any]]:
+def _read_pcd(path: Path, raw: bytes, columns: Sequence[str]) -> dict[str, NDArray[Any]]:
     try:
         from pypcd4 import PointCloud
     except ImportError:
@@ -130,10 +131,10 @@ def _read_pcd(path: Path, columns: Sequence[str]) -> dict[str, NDArray[Any]]:
         return {name: cloud.pc_data[name].reshape(-1) for name in cloud.fields}
     except Exception as error:
         # the library raises whatever its parsing ran into
-        raise FormatError(f"{path} cannot be read as a PCD file ({str(error).splitlines()[0][:120]})") from None
+        raise FormatError(f"{path} cannot be read as a PCD file ({shortened(error)})") from None
 
 
-def _read_las(path: Path, columns: Sequence[str]) -> dict[str, NDArray[Any]]:
+def _read_las(path: Path, raw: bytes, columns: Sequence[str]) -> dict[str, NDArray[Any]]:
     try:
         import laspy
     except ImportError:
@@ -145,12 +146,11 @@ def _read_las(path: Path, columns: Sequence[str]) -> dict[str, NDArray[Any]]:
             # written in 16 bits, whatever the scanner's own range
             fields["intensity"] = np.asarray(cloud.intensity, dtype=np.float64) / 65535
     except Exception as error:
-        raise FormatError(f"{path} cannot be read as a LAS file ({str(error).splitlines()[0][:120]})") from None
+        raise FormatError(f"{path} cannot be read as a LAS file ({shortened(error)})") from None
     return fields
 
 
-def _read_ply(path: Path, columns: Sequence[str]) -> dict[str, NDArray[Any]]:
-    raw = path.read_bytes()
+def _read_ply(path: Path, raw: bytes, columns: Sequence[str]) -> dict[str, NDArray[Any]]:
     end = raw.find(b"end_header")
     start = raw.find(b"\n", end) + 1
     if not raw.startswith(b"ply") or end < 0 or not start:
@@ -170,7 +170,7 @@ def _read_ply(path: Path, columns: Sequence[str]) -> dict[str, NDArray[Any]]:
             return {name: table[:, i] for i, (name, _) in enumerate(properties)}
         kind = np.dtype([(name, _PLY_ORDER[form] + of) for name, of in properties])
         data = np.frombuffer(raw, dtype=kind, count=count, offset=start)
-    except (KeyError, ValueError, IndexError):
+    except (KeyError, ValueError, IndexError, TypeError, OverflowError, MemoryError):
         raise FormatError(f"{path} is cut off or holds vertices that are not plain numbers") from None
     return {name: data[name] for name in kind.names or ()}
 

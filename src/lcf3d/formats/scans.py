@@ -1,5 +1,7 @@
 """LiDAR scans without a header, as KITTI and nuScenes keep them: rows of float32, told apart from what else is found.
 
+`lcf3d.formats.point_files` reads the bytes and arrays of scans with named columns through the same functions.
+
 ``.bin`` files do not say how many columns a point has or what type its numbers are. Read as something else they give
 points as well, only wrong ones: so the numbers themselves are asked. Coordinates lie within `MOST_METRES`, intensities
 are not negative; a file that fits in one way only is read that way, one that fits in none is refused.
@@ -9,7 +11,9 @@ from __future__ import annotations
 
 import io
 import logging
+import warnings
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,8 +35,9 @@ COLUMNS = (4, 5, 6, 7)
 _FEW_WRONG = 0.001
 # with fewer points than this nothing can be told from their values
 _TELLING = 16
+_NUMPY = b"\x93NUMPY"
 _MAGIC = {
-    b"\x93NUMPY": "a NumPy array",
+    _NUMPY: "a NumPy array",
     b"LASF": "a LAS file",
     b"# .PCD": "a PCD file",
     b"VERSION": "a PCD file",
@@ -60,18 +65,48 @@ def read_scan(path: Path, columns: int = 4) -> NDArray[np.float32]:
         DatasetError: the file does not exist.
         FormatError: it is cut off, of another format, or its values are not those of a scan.
     """
-    try:
-        raw = read_bytes(path)
-    except DatasetError:
-        raise DatasetError(f"scan {path} does not exist") from None
+    raw = scan_bytes(path)
+    if path.suffix == ".npy" or raw.startswith(_NUMPY):
+        return _checked(path, npy_array(path, raw))
+    require_bare(path, raw, columns)
+    return _read_bare(path, raw, columns)
+
+
+def scan_bytes(path: Path) -> bytes:
+    """The content of a scan's file.
+
+    Raises:
+        DatasetError: it does not exist.
+        FormatError: it is no regular file, or too large.
+    """
+    if not path.exists():
+        raise DatasetError(f"scan {path} does not exist")
+    return read_bytes(path)
+
+
+def require_bare(path: Path, raw: bytes, columns: int) -> None:
+    """See that bytes begin like no known format: numbers without a header.
+
+    Raises:
+        FormatError: they do; names the format.
+    """
     kind = next((name for magic, name in _MAGIC.items() if raw.startswith(magic)), None)
-    if kind == "a NumPy array":
-        return _read_npy(path, raw)
     if kind is not None:
         raise FormatError(f"{path} is {kind}, not a scan of {columns} float32 a point; convert it")
-    if path.suffix == ".npy":
+
+
+def npy_array(path: Path, raw: bytes) -> NDArray[Any]:
+    """The array in the bytes of a ``.npy`` file, of whatever shape and type; no objects.
+
+    Raises:
+        FormatError: they are no such file.
+    """
+    if not raw.startswith(_NUMPY):
         raise FormatError(f"{path} is not a NumPy array: its header is missing")
-    return _read_bare(path, raw, columns)
+    with reading(path, "a NumPy array of points"), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        array: NDArray[Any] = np.load(io.BytesIO(raw), allow_pickle=False)
+    return array
 
 
 def unit_intensity(points: NDArray[np.float32], path: Path) -> NDArray[np.float32]:
@@ -113,9 +148,8 @@ def scan_problem(points: FloatArray | NDArray[np.float32]) -> str:
     return ""
 
 
-def _read_npy(path: Path, raw: bytes) -> NDArray[np.float32]:
-    with reading(path, "a NumPy array of points"):
-        table = np.load(io.BytesIO(raw), allow_pickle=False)
+def _checked(path: Path, table: NDArray[Any]) -> NDArray[np.float32]:
+    """A NumPy array as a scan, where shape and values are those of one."""
     if table.ndim != 2 or not 4 <= table.shape[1] <= 16 or table.dtype.kind not in "fiu":
         raise FormatError(
             f"{path} must hold N x 4 numbers (x, y, z, intensity), got {shortened(table.shape)} of {table.dtype}"

@@ -6,6 +6,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,29 +14,39 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lcf3d.detectors.joins import LeftOut, join_classes
 from lcf3d.errors import FormatError, MissingExtraError
-from lcf3d.files import atomic_path
+from lcf3d.files import atomic_path, reading, require_file, shortened
+from lcf3d.remote.places import fetched
 from lcf3d.structures import Detections2D, Detections3D
 
 BOX_3D = ("x", "y", "z", "length", "width", "height", "yaw")
 BOX_2D = ("x1", "y1", "x2", "y2")
 
 
-def read_table_3d(path: Path, class_names: Sequence[str]) -> dict[str, Detections3D]:
+def read_table_3d(path: Path, class_names: Sequence[str], left_out: LeftOut | None = None) -> dict[str, Detections3D]:
     """3D detections by frame; frames whose detections are all of other classes stay, empty.
+
+    Args:
+        path: the table.
+        class_names: classes to keep, joined as by `join_classes`; others are left out.
+        left_out: counts detections of other classes.
 
     Raises:
         FormatError: the file is absent, no parquet table, or lacks a column; names it.
         MissingExtraError: pyarrow is not installed.
     """
     table = _read(path, ("frame", "class"), BOX_3D)
-    return {str(key[0]): Detections3D(*parts) for key, parts in _grouped(path, table, BOX_3D, (), class_names).items()}
+    groups = _grouped(table, BOX_3D, (), class_names, left_out)
+    return {str(key[0]): Detections3D(*parts) for key, parts in groups.items()}
 
 
-def read_table_2d(path: Path, class_names: Sequence[str]) -> dict[tuple[str, str], Detections2D]:
+def read_table_2d(
+    path: Path, class_names: Sequence[str], left_out: LeftOut | None = None
+) -> dict[tuple[str, str], Detections2D]:
     """2D detections by (frame, camera); see `read_table_3d`."""
     table = _read(path, ("frame", "camera", "class"), BOX_2D)
-    groups = _grouped(path, table, BOX_2D, ("camera",), class_names)
+    groups = _grouped(table, BOX_2D, ("camera",), class_names, left_out)
     return {(key[0], key[1]): Detections2D(*parts) for key, parts in groups.items()}
 
 
@@ -95,20 +106,25 @@ def _write(path: Path, columns: Mapping[str, list[Any]]) -> None:
 
 
 def _read(path: Path, texts: Sequence[str], numbers: Sequence[str]) -> dict[str, NDArray[Any]]:
-    arrow, parquet = _parquet("reading parquet tables")
+    _, parquet = _parquet("reading parquet tables")
+    if not fetched(path).exists():
+        raise FormatError(f"{path} does not exist")
+    require_file(path)
     try:
-        table = parquet.read_table(path)
-    except FileNotFoundError:
-        raise FormatError(f"{path} does not exist") from None
-    except (arrow.ArrowInvalid, OSError) as error:
-        raise FormatError(f"{path} cannot be read as a parquet table ({str(error).splitlines()[0]})") from None
+        with reading(path, "a parquet table"):
+            table = parquet.read_table(path)
+            # what is damaged would be read beyond its end
+            table.validate(full=True)
+    except OSError as error:
+        raise FormatError(f"{path} cannot be read as a parquet table ({shortened(error)})") from None
     absent = [name for name in (*texts, *numbers) if name not in table.column_names]
     if absent:
         raise FormatError(f"{path} has no column {', '.join(absent)}; it holds {', '.join(table.column_names)}")
     found: dict[str, NDArray[Any]] = {}
     try:
-        for name in texts:
-            found[name] = np.array([str(value) for value in table[name].to_pylist()], dtype=np.str_)
+        with reading(path, "a parquet table"):
+            for name in texts:
+                found[name] = np.array([str(value) for value in table[name].to_pylist()], dtype=np.str_)
         for name in (*numbers, *(("score",) if "score" in table.column_names else ())):
             found[name] = np.array(table[name].to_pylist(), dtype=np.float64)
     except (TypeError, ValueError):
@@ -121,11 +137,18 @@ def _read(path: Path, texts: Sequence[str], numbers: Sequence[str]) -> dict[str,
 
 
 def _grouped(
-    path: Path, table: Mapping[str, NDArray[Any]], box: Sequence[str], keys: Sequence[str], class_names: Sequence[str]
+    table: Mapping[str, NDArray[Any]],
+    box: Sequence[str],
+    keys: Sequence[str],
+    class_names: Sequence[str],
+    left_out: LeftOut | None,
 ) -> dict[tuple[str, ...], tuple[Any, Any, Any, tuple[str, ...]]]:
     """Boxes, scores, labels and class names by frame and ``keys``."""
     names = tuple(class_names)
-    index = {name: i for i, name in enumerate(names)}
+    own = Counter(table["class"].tolist())
+    index = {name: names.index(target) for name, target in join_classes(own, names).items()}
+    if left_out is not None:
+        left_out.classes.update({name: count for name, count in own.items() if name not in index})
     labels = np.array([index.get(name, -1) for name in table["class"].tolist()], dtype=np.int64)
     boxes = np.stack([table[name] for name in box], axis=1) if len(labels) else np.zeros((0, len(box)))
     rows: dict[tuple[str, ...], list[int]] = {}

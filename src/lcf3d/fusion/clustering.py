@@ -17,6 +17,8 @@ _CODES = {"cliques": 0, "components": 1, "nms": 2}
 
 # cluster of a box that non-maximum suppression removed
 SUPPRESSED = -1
+# rows of cells lie so far apart in the hash table of cells
+STRIDE = 7919
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,35 +94,41 @@ def _cluster_sorted(boxes, labels, iou_threshold, class_aware, method):  # type:
 def _links(boxes, labels, iou_threshold, class_aware):  # type: ignore[no-untyped-def]
     """Linked later boxes of every box: (E,) neighbours in ascending order and (N + 1,) offsets.
 
-    Boxes are sorted into square cells as wide as the largest box, so that only nine cells need a look.
+    Boxes are put into square cells as wide as the largest box, so that only nine cells need a look. Plain loops: numba
+    compiles numpy's sorting and searching for longer than all of this.
     """
     n = len(boxes)
-    cos, sin = np.cos(boxes[:, 6]), np.sin(boxes[:, 6])
-    reach = 0.0
+    cos, sin, cells = np.empty(n), np.empty(n), np.empty((n, 2), np.int64)
+    x, y, reach = np.inf, np.inf, 1e-3
     for i in range(n):
-        reach = max(reach, math.hypot(boxes[i, 3], boxes[i, 4]))
-    cell = max(reach, 1e-3)
-    column = np.floor((boxes[:, 0] - boxes[:, 0].min()) / cell).astype(np.int64)
-    row = np.floor((boxes[:, 1] - boxes[:, 1].min()) / cell).astype(np.int64)
-    stride = row.max() + 3
-    key = (column + 1) * stride + row + 1
-    by_key = np.argsort(key, kind="mergesort")
-    sorted_key = key[by_key]
-    neighbours = np.empty(4 * n + 16, np.int64)
-    offsets = np.zeros(n + 1, np.int64)
+        cos[i], sin[i] = math.cos(boxes[i, 6]), math.sin(boxes[i, 6])
+        x, y, reach = min(x, boxes[i, 0]), min(y, boxes[i, 1]), max(reach, math.hypot(boxes[i, 3], boxes[i, 4]))
+    for i in range(n):
+        cells[i, 0], cells[i, 1] = int((boxes[i, 0] - x) / reach), int((boxes[i, 1] - y) / reach)
+    slots = 16
+    while slots < 2 * n:
+        slots *= 2
+    # of each slot of a hash table the first box, and of each box the next one in its slot
+    first_of, next_of = np.empty(slots, np.int64), np.empty(n, np.int64)
+    for slot in range(slots):
+        first_of[slot] = -1
+    for i in range(n - 1, -1, -1):
+        slot = (cells[i, 0] * STRIDE + cells[i, 1]) & (slots - 1)
+        next_of[i], first_of[slot] = first_of[slot], i
+    pairs = np.empty((4 * n + 16, 2), np.int64)
     links = 0
     for i in range(n):
-        first = links
         area = boxes[i, 3] * boxes[i, 4]
-        for step in range(-1, 2):
-            low = np.searchsorted(sorted_key, key[i] + step * stride - 1)
-            for at in range(low, n):
-                if sorted_key[at] > key[i] + step * stride + 1:
-                    break
-                j = by_key[at]
-                if j <= i or (class_aware and labels[i] != labels[j]):
+        for step in range(9):
+            column, row = cells[i, 0] + step // 3 - 1, cells[i, 1] + step % 3 - 1
+            j = first_of[(column * STRIDE + row) & (slots - 1)]
+            while j >= 0:
+                here, j = j, next_of[j]
+                if here <= i or cells[here, 0] != column or cells[here, 1] != row:
                     continue
-                other = boxes[j, 3] * boxes[j, 4]
+                if class_aware and labels[i] != labels[here]:
+                    continue
+                other = boxes[here, 3] * boxes[here, 4]
                 # the IoU cannot exceed the ratio of the areas
                 if min(area, other) <= iou_threshold * max(area, other):
                     continue
@@ -131,30 +139,63 @@ def _links(boxes, labels, iou_threshold, class_aware):  # type: ignore[no-untype
                     boxes[i, 4],
                     cos[i],
                     sin[i],
-                    boxes[j, 0],
-                    boxes[j, 1],
-                    boxes[j, 3],
-                    boxes[j, 4],
-                    cos[j],
-                    sin[j],
+                    boxes[here, 0],
+                    boxes[here, 1],
+                    boxes[here, 3],
+                    boxes[here, 4],
+                    cos[here],
+                    sin[here],
                 )
                 if shared > iou_threshold * (area + other - shared):
-                    if links == len(neighbours):
-                        neighbours = np.concatenate((neighbours, np.empty(links, np.int64)))
-                    neighbours[links] = j
+                    if links == len(pairs):
+                        pairs = _doubled(pairs)
+                    pairs[links, 0], pairs[links, 1] = i, here
                     links += 1
-        neighbours[first:links].sort()
-        offsets[i + 1] = links
-    return neighbours[:links], offsets
+    return _rows(pairs[:links], n)
+
+
+@kernel
+def _doubled(pairs):  # type: ignore[no-untyped-def]
+    """A copy of (E, 2) pairs with place for as many again."""
+    longer = np.empty((2 * len(pairs), 2), np.int64)
+    for e in range(len(pairs)):
+        longer[e, 0], longer[e, 1] = pairs[e, 0], pairs[e, 1]
+    return longer
+
+
+@kernel
+def _rows(pairs, n):  # type: ignore[no-untyped-def]
+    """(E,) second boxes of (E, 2) pairs in the ascending rows of their first ones, and (n + 1,) where rows begin."""
+    offsets, starts = np.empty(n + 1, np.int64), np.empty(n + 1, np.int64)
+    for i in range(n + 1):
+        offsets[i] = starts[i] = 0
+    for e in range(len(pairs)):
+        offsets[pairs[e, 0] + 1] += 1
+        starts[pairs[e, 1] + 1] += 1
+    for i in range(n):
+        offsets[i + 1] += offsets[i]
+        starts[i + 1] += starts[i]
+    # ordered by their second boxes, they fill each row in ascending order
+    order, neighbours = np.empty(len(pairs), np.int64), np.empty(len(pairs), np.int64)
+    for e in range(len(pairs)):
+        order[starts[pairs[e, 1]]] = e
+        starts[pairs[e, 1]] += 1
+    for i in range(n):
+        starts[i] = offsets[i]
+    for k in range(len(pairs)):
+        i = pairs[order[k], 0]
+        neighbours[starts[i]] = pairs[order[k], 1]
+        starts[i] += 1
+    return neighbours, offsets
 
 
 @kernel
 def _partition(neighbours, offsets, method):  # type: ignore[no-untyped-def]
     """Cluster index of boxes sorted by descending score, from their links; ``method`` is a code of ``_CODES``."""
     n = len(offsets) - 1
-    cluster = np.full(n, -2, np.int64)
-    shared = np.zeros(n, np.int64)
-    members = 0
+    cluster, shared = np.empty(n, np.int64), np.empty(n, np.int64)
+    for i in range(n):
+        cluster[i], shared[i] = -2, 0
     clusters = 0
     if method == 1:
         return _components(neighbours, offsets)
@@ -192,7 +233,9 @@ def _partition(neighbours, offsets, method):  # type: ignore[no-untyped-def]
 def _components(neighbours, offsets):  # type: ignore[no-untyped-def]
     """Connected components, numbered by their first box."""
     n = len(offsets) - 1
-    root = np.arange(n)
+    root = np.empty(n, np.int64)
+    for i in range(n):
+        root[i] = i
     for i in range(n):
         for at in range(offsets[i], offsets[i + 1]):
             a, b = i, neighbours[at]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
@@ -136,8 +137,8 @@ def points_in_image_boxes(
         candidates, pixels = _project_into(points, np.array(camera.pixels_from_lidar), NEAR, boxes)
     else:
         candidates, pixels = _bend_into(points, lens_numbers(camera), boxes)
-    index, at, offsets = _by_box(candidates, pixels, boxes)
-    return index, at, offsets
+    hits, offsets = _by_box(pixels, boxes)
+    return candidates[hits], pixels[hits], offsets
 
 
 @kernel
@@ -167,23 +168,25 @@ def _around(boxes):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _by_box(candidates, pixels, boxes):  # type: ignore[no-untyped-def]
-    """What `points_in_image_boxes` returns, of candidate points at pixels."""
-    offsets = np.zeros(len(boxes) + 1, np.int64)
-    hits = np.empty(len(candidates) + 1, np.int64)
+def _by_box(pixels, boxes):  # type: ignore[no-untyped-def]
+    """Which pixels lie in each box, one box after the other, and where each box's begin."""
+    offsets, hits = np.empty(len(boxes) + 1, np.int64), np.empty(len(pixels) + 1, np.int64)
+    offsets[0] = 0
     for k in range(len(boxes)):
         x1, y1, x2, y2 = boxes[k, 0], boxes[k, 1], boxes[k, 2], boxes[k, 3]
         first = offsets[k]
-        if len(hits) < first + len(candidates) + 1:
-            hits = np.concatenate((hits, np.empty(len(hits) + len(candidates), np.int64)))
+        if len(hits) < first + len(pixels) + 1:
+            longer = np.empty(2 * len(hits) + len(pixels), np.int64)
+            for n in range(first):
+                longer[n] = hits[n]
+            hits = longer
         at = first
-        for n in range(len(candidates)):  # without branches, which would be guessed wrongly half of the time
+        for n in range(len(pixels)):  # without branches, which would be guessed wrongly half of the time
             u, v = pixels[n, 0], pixels[n, 1]
             hits[at] = n
             at += (x1 <= u) & (u <= x2) & (y1 <= v) & (v <= y2)
         offsets[k + 1] = at
-    hits = hits[: offsets[-1]]
-    return candidates[hits], pixels[hits], offsets
+    return hits[: offsets[len(boxes)]], offsets
 
 
 @kernel
@@ -233,7 +236,7 @@ def _gaussian(pixels, x1, y1, x2, y2):  # type: ignore[no-untyped-def]
     mask = np.empty(len(pixels), np.float32)
     for n in range(len(pixels)):
         a, b = (pixels[n, 0] - u) / width, (pixels[n, 1] - v) / height
-        mask[n] = np.exp(-0.5 * (a * a + b * b))
+        mask[n] = math.exp(-0.5 * (a * a + b * b))
     return mask
 
 

@@ -27,7 +27,9 @@ FIELD_RADIUS = 8.0
 @kernel
 def ordered(values):  # type: ignore[no-untyped-def]
     """A sorted copy of a short array (numba); one compiled sort serves all of the localizer."""
-    result = values.copy()
+    result = np.empty(len(values))
+    for i in range(len(values)):
+        result[i] = values[i]
     for i in range(1, len(result)):
         value, j = result[i], i - 1
         while j >= 0 and result[j] > value:
@@ -48,8 +50,11 @@ def lowest_returns(cloud):  # type: ignore[no-untyped-def]
         (SIDE, SIDE, 3) x, y, z in metres, indexed by x then y, cells of `CELL` metres from -`REACH`; z is inf where
         nothing was hit.
     """
-    grid = np.full((SIDE, SIDE, 3), np.float32(np.inf), np.float32)
-    reach, per_metre = np.float32(REACH), np.float32(1 / CELL)
+    grid, reach, per_metre = np.empty((SIDE, SIDE, 3), np.float32), np.float32(REACH), np.float32(1 / CELL)
+    for a in range(SIDE):
+        for b in range(SIDE):
+            for c in range(3):
+                grid[a, b, c] = np.inf
     for n in range(0, len(cloud), 1 + len(cloud) // ENOUGH_POINTS):
         i, j = (cloud[n, 0] + reach) * per_metre, (cloud[n, 1] + reach) * per_metre
         if 0.0 <= i < SIDE and 0.0 <= j < SIDE:
@@ -78,7 +83,8 @@ def fit_plane(grid, x, y, radius, plane):  # type: ignore[no-untyped-def]
     """
     reach = int(radius / CELL) + 1
     ci, cj = int((x + REACH) / CELL), int((y + REACH) / CELL)
-    cells, above = np.empty(((2 * reach + 1) ** 2, 3)), np.empty((2 * reach + 1) ** 2)
+    side = 2 * reach + 1
+    cells, above = np.empty((side * side, 3)), np.empty(side * side)
     n = 0
     for i in range(max(ci - reach, 0), min(ci + reach + 1, SIDE)):
         for j in range(max(cj - reach, 0), min(cj + reach + 1, SIDE)):
@@ -89,30 +95,33 @@ def fit_plane(grid, x, y, radius, plane):  # type: ignore[no-untyped-def]
                 n += 1
     if n == 0:
         return
-    expected = plane.copy()
+    expected = np.empty(3)
+    for i in range(3):
+        expected[i] = plane[i]
     level = ordered(above[:n])[n // 4]
     # where even the lowest quarter is higher than a plausible slope allows, only walls and objects were hit
     if not level > expected[0] + 0.5 + 0.1 * radius:
         plane[0] = level
     for step in range(6):
         scale = 0.6 if step < 2 else (0.3 if step < 4 else 0.15)
-        _solve_plane(cells, n, scale, SLOPE_BELIEF * 0.25 * radius * radius, expected, plane)
+        _solve_plane(cells[:n], scale, SLOPE_BELIEF * 0.25 * radius * radius, expected, plane)
 
 
 @kernel
-def _solve_plane(cells, n, scale, slope_belief, expected, plane):  # type: ignore[no-untyped-def]
+def _solve_plane(cells, scale, slope_belief, expected, plane):  # type: ignore[no-untyped-def]
     """One step of the reweighted least squares of `fit_plane`, from ``plane`` to ``plane``."""
     sw = su = sv = sz = suv = 0.0
     suu = svv = slope_belief
     suz, svz = slope_belief * expected[1], slope_belief * expected[2]
     if expected[0] == expected[0]:
         sw, sz = HEIGHT_BELIEF, HEIGHT_BELIEF * expected[0]
-    for k in range(n):
+    for k in range(len(cells)):
         u, v, z = cells[k, 0], cells[k, 1], cells[k, 2]
         residual = (z - (plane[0] + plane[1] * u + plane[2] * v)) / scale
         if residual < 0.0:
             residual *= 0.5
-        weight = 1.0 / (1.0 + residual * residual) ** 2
+        square = 1.0 + residual * residual
+        weight = 1.0 / (square * square)
         sw += weight
         su += weight * u
         sv += weight * v

@@ -100,7 +100,9 @@ def range_profile(reaches, weights, window, planes, height, projection, image_si
         box2d: (4,) pixels.
         profile: (BINS,) filled; 0 where no point lies.
     """
-    histogram = np.zeros(BINS)
+    histogram = np.empty(BINS)
+    for b in range(BINS):
+        histogram[b] = 0.0
     for n in range(len(reaches)):
         if weights[n] > 0.0:
             histogram[int(reaches[n] / BIN)] += weights[n]
@@ -149,15 +151,17 @@ def take_cluster(points, reaches, weights, low, high, gap, taken):  # type: igno
                 taken[used, 0], taken[used, 1], taken[used, 2] = points[i, 0], points[i, 1], weights[i]
                 used += 1
             seen += 1
-    kept = _heaviest_component(taken, used, gap)
+    kept = _heaviest_component(taken[:used], gap)
     return kept, kept * stride
 
 
 @kernel
-def _heaviest_component(taken, used, gap):  # type: ignore[no-untyped-def]
-    """Move the heaviest component of the first ``used`` rows to the front; returns its size."""
-    component = np.full(used, -1)
-    stack = np.empty(used, np.int64)
+def _heaviest_component(taken, gap):  # type: ignore[no-untyped-def]
+    """Move the rows of the heaviest component to the front; returns its size."""
+    used = len(taken)
+    component, stack = np.empty(used, np.int64), np.empty(used, np.int64)
+    for i in range(used):
+        component[i] = -1
     heaviest, most, components = -1, 0.0, 0
     for first in range(used):
         if component[first] >= 0:

@@ -204,13 +204,17 @@ def search(points, evidence):  # type: ignore[no-untyped-def]
     Returns:
         (7,) parameters and the energy.
     """
-    energies, starts = np.full(STARTS, np.inf), np.empty((STARTS, PARAMETERS))
-    q = np.zeros(PARAMETERS)
+    energies, starts, q = np.empty(STARTS), np.empty((STARTS, PARAMETERS)), np.empty(PARAMETERS)
+    for k in range(STARTS):
+        energies[k] = np.inf
+    q[LIFT] = 0.0
     for i in range(3):
         q[LENGTH + i] = evidence[MEAN + i]
     us, vs = np.empty(len(points)), np.empty(len(points))
     half = len(points) // 2
-    middle_x, middle_y = ordered(points[:, 0])[half], ordered(points[:, 1])[half]
+    for i in range(len(points)):
+        us[i], vs[i] = points[i, 0], points[i, 1]
+    middle_x, middle_y = ordered(us)[half], ordered(vs)[half]
     for t in range(YAWS):
         q[YAW] = math.pi * t / YAWS
         cos, sin = math.cos(q[YAW]), math.sin(q[YAW])
@@ -224,10 +228,10 @@ def search(points, evidence):  # type: ignore[no-untyped-def]
     best = 0
     for k in range(STARTS):
         if energies[k] < np.inf:
-            energies[k] = refine(starts[k], FIRST_ROUNDS, points, evidence)
+            energies[k] = refine(starts[k], int(FIRST_ROUNDS), points, evidence)
         if energies[k] < energies[best]:
             best = k
-    return starts[best], refine(starts[best], LAST_ROUNDS, points, evidence)
+    return starts[best], refine(starts[best], int(LAST_ROUNDS), points, evidence)
 
 
 @kernel
@@ -250,4 +254,5 @@ def _keep_best(energies, starts, value, q):  # type: ignore[no-untyped-def]
             place = k
     if value < energies[place]:
         energies[place] = value
-        starts[place] = q
+        for i in range(PARAMETERS):
+            starts[place, i] = q[i]

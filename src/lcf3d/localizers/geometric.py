@@ -152,15 +152,18 @@ def _localize_all(  # type: ignore[no-untyped-def]
     for k in range(len(offsets) - 1):
         part, weight = points[offsets[k] : offsets[k + 1]], gaussian[offsets[k] : offsets[k + 1]]
         expected = around[0]
-        if np.isnan(expected):
+        if math.isnan(expected):
             # nothing was hit around the sensor: let the lowest point stand on the ground
             expected = np.inf
             for i in range(len(part)):
                 if part[i, 2] < expected:
                     expected = part[i, 2]
         ground_along(grid, axis_yaw[k], expected, planes)
-        evidence[PROJECTION:IMAGE_SIZE] = projections[k].ravel()
-        evidence[IMAGE_SIZE:BOX2D], evidence[BOX2D:EDGE_SIGMA] = image_sizes[k], boxes2d[k]
+        for i in range(4):
+            evidence[BOX2D + i] = boxes2d[k, i]
+            for r in range(3):
+                evidence[PROJECTION + 4 * r + i] = projections[k, r, i]
+        evidence[IMAGE_SIZE], evidence[IMAGE_SIZE + 1] = image_sizes[k, 0], image_sizes[k, 1]
         quality[k] = _localize_one(part, weight, rows[k], planes, projections[k], evidence, boxes[k])
 
 
@@ -171,12 +174,12 @@ def _localize_one(points, gaussian, row, planes, projection, evidence, box):  # 
     taken = np.empty((MOST_POINTS, 3))
     weigh_points(points, gaussian, planes, row[2], reaches, weights)
     diagonal = math.hypot(row[0], row[1])
-    window = 0.5 if np.isnan(diagonal) else (0.25 if row[6] > 0.0 else 0.5) * diagonal
+    window = 0.5 if math.isnan(diagonal) else (0.25 if row[6] > 0.0 else 0.5) * diagonal
     image_size, box2d = evidence[IMAGE_SIZE:BOX2D], evidence[BOX2D:EDGE_SIGMA]
     range_profile(reaches, weights, window, planes, row[2], projection, image_size, box2d, profile)
-    first, best, quality = profile[np.argmax(profile)], np.inf, 0.0
+    first, best, quality = profile[_peak(profile)], np.inf, 0.0
     for _ in range(CLUSTERS):
-        peak = np.argmax(profile)
+        peak = _peak(profile)
         score = profile[peak]
         if score <= SECOND_SHARE * first:
             break
@@ -188,20 +191,34 @@ def _localize_one(points, gaussian, row, planes, projection, evidence, box):  # 
         used, count = take_cluster(points, reaches, weights, near - 0.25 * reach, near + 1.4 * reach, gap, taken)
         if used >= FEWEST_POINTS:
             evidence[STRENGTH] = (SOLID_STRENGTH if solid else OPEN_STRENGTH) * min(1.0, count / FULL_COUNT)
-            evidence[GROUND:PROJECTION] = plane
+            for i in range(3):
+                evidence[GROUND + i] = plane[i]
             q, value = search(taken[:used], evidence)
             value += SCORE_COST * math.log(first / score)
             if value < best:
                 best = value
-                box[:] = q
+                for i in range(7):
+                    box[i] = q[i]
                 box[2] = plane[0] + plane[1] * q[X] + plane[2] * q[Y] + q[LIFT] + 0.5 * q[HEIGHT]
                 quality = _quality(q, taken[:used], evidence, count)
         hidden = int(max(window, 1.0) / BIN)
-        profile[max(peak - hidden, 0) : peak + hidden + 1] = 0.0
+        for b in range(max(peak - hidden, 0), min(peak + hidden + 1, BINS)):
+            profile[b] = 0.0
     if quality < LEAST_QUALITY:
-        box[:] = np.nan
+        for i in range(7):
+            box[i] = np.nan
         return 0.0
     return quality
+
+
+@kernel
+def _peak(profile):  # type: ignore[no-untyped-def]
+    """Place of the highest value, the first of equal ones."""
+    peak = 0
+    for b in range(1, len(profile)):
+        if profile[b] > profile[peak]:
+            peak = b
+    return peak
 
 
 @kernel
@@ -211,7 +228,7 @@ def _set_size(row, near, plane, projection, evidence):  # type: ignore[no-untype
     edge, solid = row[7], row[6] > 0.0
     for i in range(3):
         evidence[MEAN + i], evidence[DEVIATION + i] = row[i], row[3 + i]
-    if np.isnan(row[0]):
+    if math.isnan(row[0]):
         foot = plane[0] + plane[1] * near
         depth = max(projection[2, 0] * near + projection[2, 2] * foot + projection[2, 3], 0.5)
         across = math.hypot(projection[0, 1], projection[1, 1]) / depth

@@ -25,16 +25,17 @@ def ground_along(grid, yaw, expected, planes):  # type: ignore[no-untyped-def]
     ``FIRST_STATION * STATION_STEP ** s``. ``expected`` is the height at the sensor's foot.
     """
     cos, sin = math.cos(yaw), math.sin(yaw)
-    plane = np.array([expected, 0.0, 0.0])
-    before = 0.0
+    plane = np.empty(3)
+    plane[0], plane[1], plane[2] = expected, 0.0, 0.0
+    before, reach = 0.0, FIRST_STATION
     for s in range(STATIONS):
-        reach = FIRST_STATION * STATION_STEP**s
         plane[0] += (plane[1] * cos + plane[2] * sin) * (reach - before)
         fit_plane(grid, reach * cos, reach * sin, RADIUS, plane)
         planes[s, 1] = plane[1] * cos + plane[2] * sin
         planes[s, 2] = plane[2] * cos - plane[1] * sin
         planes[s, 0] = plane[0] - planes[s, 1] * reach
         before = reach
+        reach *= STATION_STEP
 
 
 @kernel

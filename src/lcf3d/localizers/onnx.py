@@ -11,7 +11,7 @@ from lcf3d.errors import DetectorError
 from lcf3d.fusion.frustum import FrustumProposals
 from lcf3d.localizers.frustum_inputs import network_inputs
 from lcf3d.localizers.spec import LocalizerSpec, decode_boxes
-from lcf3d.networks.onnx import open_session
+from lcf3d.networks.onnx import open_session, read_metadata
 from lcf3d.structures import FloatArray
 
 SPEC_KEY = "lcf3d.localizer"
@@ -35,7 +35,7 @@ class OnnxLocalizer:
 
     def __init__(self, path: Path | str, threads: int = 1) -> None:
         self._session = open_session(Path(path), threads, "a frustum network")
-        metadata = self._session.get_modelmeta().custom_metadata_map
+        metadata = read_metadata(self._session, path)
         if SPEC_KEY not in metadata:
             raise DetectorError(f"{path} is no frustum network of lcf3d: its metadata has no {SPEC_KEY}")
         self.spec = LocalizerSpec.from_json(metadata[SPEC_KEY])

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lcf3d.errors import ConfigError
+from lcf3d.files import shortened
 from lcf3d.geometry.boxes import wrap_angle
 from lcf3d.structures import FloatArray, IntArray
 
@@ -93,7 +94,7 @@ class LocalizerSpec:
             templates = tuple(tuple(float(v) for v in row) for row in values.pop("templates"))
             spec = cls(class_names=tuple(values.pop("class_names")), templates=templates, **values)  # type: ignore[arg-type]
         except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError) as error:
-            raise ConfigError(f"not the configuration of a frustum network: {error}") from None
+            raise ConfigError(f"not the configuration of a frustum network: {shortened(error)}") from None
         if spec.version != 1:
             raise ConfigError(f"a frustum network of version {spec.version}; this lcf3d reads version 1: update lcf3d")
         return spec

@@ -51,6 +51,18 @@ class Session:
         return open_session, self._opened_with
 
 
+def read_metadata(session: Any, path: Path | str) -> dict[str, str]:
+    """The texts that a network carries by their names.
+
+    Raises:
+        DetectorError: they are no texts: the file is damaged.
+    """
+    try:
+        return dict(session.get_modelmeta().custom_metadata_map)
+    except UnicodeDecodeError as error:
+        raise DetectorError(f"{path}: its metadata is damaged ({error.reason}); export it again") from None
+
+
 def first_line(error: Exception) -> str:
     """The first line of an error's message, or its kind where it has none."""
     return str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__

@@ -8,12 +8,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from time import perf_counter
 from typing import Any, TypeVar
-from zipfile import BadZipFile
 
 import numpy as np
 
-from lcf3d.errors import FormatError
-from lcf3d.files import atomic_path
+from lcf3d.errors import FormatError, Lcf3dError
+from lcf3d.files import atomic_path, reading, shortened
 from lcf3d.run.frames import FrameRunner
 from lcf3d.run.sources import CameraOnImages, LidarOnScans
 from lcf3d.structures import Detections2D, Detections3D, Frame, InstanceMask
@@ -130,15 +129,15 @@ def _write(path: Path, found: Detections2D | Detections3D, milliseconds: float) 
 
 def _read(path: Path, kind: type[Found]) -> tuple[Found, float]:
     try:
-        with np.load(path, allow_pickle=False) as content:
+        with reading(path, "kept detections"), np.load(path, allow_pickle=False) as content:
             arrays: dict[str, Any] = {name: content[name] for name in content.files if not name.startswith("mask_")}
             names = tuple(arrays.pop("class_names").tolist())
             milliseconds = float(arrays.pop("milliseconds"))
             if "masks" in arrays:
                 arrays["masks"] = tuple(_mask(content, i) for i in range(int(arrays["masks"])))
-        return kind(class_names=names, **arrays), milliseconds
-    except (OSError, ValueError, KeyError, TypeError, BadZipFile) as error:
-        raise FormatError(f"{path} is damaged ({error}); delete it and run again") from None
+            return kind(class_names=names, **arrays), milliseconds
+    except (OSError, Lcf3dError) as error:
+        raise FormatError(f"{path} is damaged ({shortened(error)}); delete it and run again") from None
 
 
 def _mask(content: Any, i: int) -> InstanceMask | None:

@@ -56,6 +56,16 @@ def report_notes(reports: Mapping[str, Collection[str]], config: FusionConfig) -
     )
 
 
+def score_notes(config: FusionConfig) -> tuple[str, ...]:
+    """What the scores are where they are no probabilities."""
+    if config.ensemble != "product":
+        return ()
+    return (
+        "scores of matched detections are the product s3d s2d / p(class) of the paper: they may exceed 1, order the "
+        "detections and are no probabilities (ensemble: evidence or probabilistic stays within 0 to 1)",
+    )
+
+
 def _by_branch(lidar: LidarSource, cameras: Mapping[str, CameraSource]) -> list[tuple[str, LeftOut]]:
     found = [("lidar", lidar), *((f"camera {name}", source) for name, source in cameras.items())]
     seen: set[int] = set()

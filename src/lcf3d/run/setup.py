@@ -24,7 +24,7 @@ from lcf3d.localizers.named import load_localizer
 from lcf3d.run.alignment import aligned_frame, describe, find_alignment
 from lcf3d.run.folder import RunFolder
 from lcf3d.run.frames import FrameRunner
-from lcf3d.run.joins import FEW_FRAMES, left_out_counts, left_out_notes, report_notes, reported_classes
+from lcf3d.run.joins import FEW_FRAMES, left_out_counts, left_out_notes, report_notes, reported_classes, score_notes
 from lcf3d.run.settings import build_config
 from lcf3d.run.shards import frames_of_shard
 from lcf3d.run.sources import CameraOnImages, DetectorOnFrames, LidarOnScans, open_cameras, open_lidar
@@ -162,7 +162,7 @@ def prepare_run(
         if require is not None:
             require(getattr(calibration, maps) if calibration else ())
     reported = reported_classes(cameras, config, len(frame_ids))
-    notes = (*left_out_notes(lidar, cameras), *report_notes(reported, config))
+    notes = (*left_out_notes(lidar, cameras), *report_notes(reported, config), *score_notes(config))
     written: dict[str, Any] = {
         "lcf3d": __version__,
         **asdict(request),

@@ -18,7 +18,7 @@ from lcf3d.detectors.camera.tiling import merge_tiles, non_maximum_suppression, 
 from lcf3d.detectors.classes import COCO_CLASSES, read_class_names, reported_classes, to_classes
 from lcf3d.errors import ConfigError, DetectorError, ShapeError
 from lcf3d.files import shortened
-from lcf3d.networks.onnx import first_line, open_session
+from lcf3d.networks.onnx import first_line, open_session, read_metadata
 from lcf3d.structures import KITTI_CLASSES, Detections2D
 
 log = logging.getLogger(__name__)
@@ -76,7 +76,7 @@ class OnnxDetector:
         self._mapping = mapping
         self._imagenet = normalize == "imagenet"
         self._session = open_session(self.path, threads, "a camera detector")
-        metadata = self._session.get_modelmeta().custom_metadata_map
+        metadata = read_metadata(self._session, path)
         image_input = self._image_input()
         self._image_name: str = image_input.name
         self._dtype = _IMAGE_TYPES[image_input.type]

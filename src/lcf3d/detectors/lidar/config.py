@@ -7,6 +7,7 @@ from typing import Any
 
 from lcf3d.detectors.base import SCAN, CloudRequest
 from lcf3d.errors import ConfigError
+from lcf3d.files import shortened
 
 CHANNELS = ("x", "y", "z", "intensity", "time")
 GROUND_MODES = ("ignored", "rest", "level")
@@ -216,8 +217,8 @@ class LidarConfig:
             if "cloud" in values:
                 values["cloud"] = CloudRequest(**values["cloud"])
             return cls(**values)
-        except (KeyError, TypeError) as error:
-            raise ConfigError(f"not a LiDAR network configuration of lcf3d: {error}") from None
+        except (KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError) as error:
+            raise ConfigError(f"not a LiDAR network configuration of lcf3d: {shortened(error)}") from None
 
 
 def _tuples(value: Any) -> Any:

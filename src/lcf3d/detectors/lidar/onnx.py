@@ -16,7 +16,8 @@ from lcf3d.detectors.lidar.inputs import encoder_inputs, map_detections
 from lcf3d.detectors.lidar.suppression import NmsMode, suppression_threshold
 from lcf3d.detectors.lidar.upright import checked
 from lcf3d.errors import ConfigError, DetectorError
-from lcf3d.networks.onnx import open_session
+from lcf3d.files import shortened
+from lcf3d.networks.onnx import open_session, read_metadata
 from lcf3d.structures import Detections3D
 
 CONFIG_KEY = "lcf3d.lidar_config"
@@ -49,10 +50,14 @@ class OnnxLidarDetector:
         if score_threshold is not None and not 0 <= score_threshold < 1:
             raise ConfigError(f"score_threshold must be in [0, 1), got {score_threshold}")
         self._session = open_session(Path(path), threads, "a LiDAR network")
-        metadata = self._session.get_modelmeta().custom_metadata_map
+        metadata = read_metadata(self._session, path)
         if CONFIG_KEY not in metadata:
             raise DetectorError(f"{path} was not exported by lcf3d: it holds no {CONFIG_KEY}")
-        config = LidarConfig.from_dict(json.loads(metadata[CONFIG_KEY]))
+        try:
+            settings = json.loads(metadata[CONFIG_KEY])
+        except (ValueError, RecursionError) as error:
+            raise DetectorError(f"{path}: its {CONFIG_KEY} is damaged ({shortened(error)}); export it again") from None
+        config = LidarConfig.from_dict(settings)
         self.config = config if candidates is None else config.with_candidates(candidates)
         self.nms = nms
         self.score_threshold = self.config.suppression.score_threshold if score_threshold is None else score_threshold
