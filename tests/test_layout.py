@@ -95,5 +95,7 @@ def test_torch_and_onnxruntime_are_imported_in_one_place() -> None:
 
 
 def test_studies_do_not_import_the_command_line() -> None:
-    studies = Path(__file__).parents[1] / "benchmarks"
-    assert not [str(path) for path in studies.rglob("*.py") if any(n.startswith("lcf3d.cli") for n in imports(path))]
+    # but for the one that writes the command line's own tables of options
+    studies = set((Path(__file__).parents[1] / "benchmarks").rglob("*.py"))
+    studies -= {path for path in studies if path.name == "option_tables.py"}
+    assert not [str(path) for path in studies if any(n.startswith("lcf3d.cli") for n in imports(path))]
