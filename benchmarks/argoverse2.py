@@ -26,10 +26,11 @@ from lcf3d.datasets.argoverse2_frames import detections_by_frame, results_of_fra
 from lcf3d.evaluation.argoverse import ArgoverseMetrics, evaluate_argoverse
 from lcf3d.formats.argoverse import read_submission
 from lcf3d.formats.coco import write_camera_detections
+from lcf3d.frame import Frame
 from lcf3d.geometry.camera import depths_of, project_boxes, project_points
 from lcf3d.geometry.iou import iou_3d
-from lcf3d.provenance import Outcome
-from lcf3d.structures import ARGOVERSE_CLASSES, Camera, FloatArray, Frame
+from lcf3d.reasons import Outcome
+from lcf3d.structures import ARGOVERSE_CLASSES, Camera, FloatArray
 from lcf3d.visualization.png import draw_frame
 from lcf3d.visualization.scene import Scene
 

@@ -25,10 +25,11 @@ from lcf3d.datasets.kitti import KittiDataset
 from lcf3d.datasets.kitti_results import image_boxes
 from lcf3d.evaluation.kitti import evaluate, result_folder
 from lcf3d.formats.kitti import KittiFrames, objects_from_detections, read_folder, write_objects
+from lcf3d.frame import Frame
 from lcf3d.fusion.alignment import rotation_of
 from lcf3d.fusion.alignment_watch import AlignmentWatch, WatchSettings
 from lcf3d.fusion.self_calibration import self_calibrate
-from lcf3d.structures import Camera, Detections2D, Detections3D, FloatArray, Frame
+from lcf3d.structures import Camera, Detections2D, Detections3D, FloatArray
 
 ANGLES = (0.0, 0.2, 0.5, 1.0, 2.0, 5.0)
 AXES = {"pitch": 0, "yaw": 1, "roll": 2}

@@ -18,8 +18,9 @@ import numpy as np
 
 from lcf3d import FusionConfig, LateCascadeFusion
 from lcf3d.datasets.nuscenes import NuscenesDataset
+from lcf3d.frame import Frame
 from lcf3d.geometry.camera import project_boxes
-from lcf3d.structures import NUSCENES_CLASSES, Detections2D, Detections3D, Frame
+from lcf3d.structures import NUSCENES_CLASSES, Detections2D, Detections3D
 
 COCO = ("car", "truck", "bus", "pedestrian", "motorcycle", "bicycle")
 OTHERS = tuple(name for name in NUSCENES_CLASSES if name not in COCO)

@@ -36,11 +36,12 @@ from lcf3d.evaluation.kitti_task import KittiEvaluation
 from lcf3d.evaluation.protocol import EvaluationOptions
 from lcf3d.evaluation.reliability import calibration_error, reliability
 from lcf3d.files import read_json, write_json
+from lcf3d.frame import Frame
 from lcf3d.fusion.calibration import Calibration
 from lcf3d.fusion.calibration_fit import block_folds
 from lcf3d.fusion.clocs import ClocsFusion
 from lcf3d.localizers.named import load_localizer
-from lcf3d.structures import KITTI_CLASSES, Camera, Detections2D, Detections3D, Frame
+from lcf3d.structures import KITTI_CLASSES, Camera, Detections2D, Detections3D
 
 CAMERA = "shipped:kitti"
 OFF, KEEP = "shipped:kitti", "shipped:kitti?nms=keep"

@@ -27,11 +27,12 @@ from lcf3d.evaluation.domain_shift import (
     in_kitti_classes,
     split_truth,
 )
+from lcf3d.frame import Frame
 from lcf3d.fusion.config import FusionConfig
 from lcf3d.fusion.pipeline import LateCascadeFusion
 from lcf3d.simulation import capture, get_preset
 from lcf3d.simulation.scene import build_scene
-from lcf3d.structures import KITTI_CLASSES, Camera, Detections3D, Frame
+from lcf3d.structures import KITTI_CLASSES, Camera, Detections3D
 
 SEED = 3201
 PRESETS = ("kitti64", "sparse16", "nuscenes32", "rain", "night")

@@ -26,14 +26,15 @@ from lcf3d.evaluation.ablation import Variant, suppressed, variants
 from lcf3d.evaluation.domain_shift import evaluate_shift, split_truth
 from lcf3d.evaluation.kitti_task import KittiEvaluation
 from lcf3d.evaluation.protocol import EvaluationOptions
+from lcf3d.frame import Frame
 from lcf3d.fusion.config import FusionConfig
 from lcf3d.fusion.pipeline import LateCascadeFusion
 from lcf3d.fusion.stereo import StereoConfig, StereoLateCascadeFusion
 from lcf3d.localizers.combined import CombinedLocalizer
 from lcf3d.localizers.geometric import GeometricLocalizer
 from lcf3d.localizers.named import ShippedLocalizer
-from lcf3d.provenance import Outcome
-from lcf3d.structures import KITTI_CLASSES, Detections2D, Detections3D, Frame
+from lcf3d.reasons import Outcome
+from lcf3d.structures import KITTI_CLASSES, Detections2D, Detections3D
 
 LIDARS = {"64 beams": 1, "16 beams": 4}
 LOCALIZERS: dict[str, Callable[[], Any]] = {

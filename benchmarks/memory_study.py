@@ -26,6 +26,7 @@ from lcf3d.datasets.kitti_results import image_boxes
 from lcf3d.evaluation.curves import average_precision, precision_recall, resampled_curves
 from lcf3d.evaluation.kitti import DIFFICULTIES, KittiEvaluator, Selection
 from lcf3d.formats.kitti import KittiFrames, objects_from_detections, read_folder
+from lcf3d.frame import Frame
 from lcf3d.fusion.calibration import Calibration
 from lcf3d.fusion.config import FusionConfig
 from lcf3d.fusion.evidence import to_log_odds, to_probability
@@ -36,7 +37,7 @@ from lcf3d.fusion.pipeline import LateCascadeFusion
 from lcf3d.geometry.iou import bev_iou
 from lcf3d.provenance import Decisions, FusedDetections
 from lcf3d.run.folder import RunFolder
-from lcf3d.structures import Detections2D, Detections3D, FloatArray, Frame, IntArray
+from lcf3d.structures import Detections2D, Detections3D, FloatArray, IntArray
 
 CLASSES = ("Car", "Pedestrian", "Cyclist")
 RESAMPLES = 300

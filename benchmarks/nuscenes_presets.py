@@ -22,9 +22,10 @@ from lcf3d import FusionConfig, LateCascadeFusion, Lcf3dError
 from lcf3d.datasets.nuscenes import NuscenesDataset
 from lcf3d.evaluation.nuscenes import NuscenesMetrics, evaluate_nuscenes
 from lcf3d.formats.nuscenes_boxes import global_from_detections
+from lcf3d.frame import Frame
 from lcf3d.fusion.evidence import Evidence
 from lcf3d.provenance import FusedDetections
-from lcf3d.structures import NUSCENES_CLASSES, Detections2D, Detections3D, Frame
+from lcf3d.structures import NUSCENES_CLASSES, Detections2D, Detections3D
 
 # the weights that the kitti preset has for people, without the competing, for every class
 _EVIDENCE = Evidence(base=-1.0, trust=1.0, support=(2.5, 4.5, 6.0, 6.0), miss=0.3, off_ground=0.0, competing=0.0)

@@ -13,7 +13,7 @@ import numpy as np
 
 from lcf3d.datasets.kitti import KittiDataset
 from lcf3d.geometry.iou import bev_iou, iou_3d
-from lcf3d.provenance import Outcome, Reason
+from lcf3d.reasons import Outcome, Reason
 from lcf3d.run.folder import RunFolder
 
 # Van and Person_sitting are neighbours of Car and Pedestrian: a box on one of them is no mistake

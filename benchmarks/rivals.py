@@ -21,8 +21,8 @@ from lcf3d.detectors.fusion.bevfusion import BEVFusion, BEVFusionNetwork
 from lcf3d.detectors.fusion.detector import FusionDetector
 from lcf3d.detectors.fusion.mvxnet import MVXNet, MVXNetwork
 from lcf3d.detectors.lidar.fusing import fuse_batch_norm
+from lcf3d.frame import Frame
 from lcf3d.networks.torch import torch
-from lcf3d.structures import Frame
 
 ORIGINAL_SECONDS = {
     "MVX-Net": 4.59,

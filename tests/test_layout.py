@@ -11,7 +11,19 @@ import lcf3d
 ROOT = Path(lcf3d.__file__).parent
 FLOORS = (
     ("errors",),
-    ("distortion", "converters", "structures", "files", "provenance", "plugins", "processes", "kernels", "remote"),
+    (
+        "distortion",
+        "converters",
+        "structures",
+        "frame",
+        "files",
+        "reasons",
+        "provenance",
+        "plugins",
+        "processes",
+        "kernels",
+        "remote",
+    ),
     ("geometry",),
     ("networks",),
     ("fusion",),

@@ -7,10 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
+from lcf3d.frame import Frame
 from lcf3d.fusion.memory import remember_sequence
 from lcf3d.geometry.boxes import bev_corners
-from lcf3d.provenance import Decisions, FusedDetections, Outcome
-from lcf3d.structures import KITTI_CLASSES, Camera, Detections2D, Detections3D, Frame
+from lcf3d.provenance import Decisions, FusedDetections
+from lcf3d.reasons import Outcome
+from lcf3d.structures import KITTI_CLASSES, Camera, Detections2D, Detections3D
 
 FRAMES, HIDDEN, ALARM = 13, (7, 8, 9, 10), (3,)
 TRUCK = [9.5, 4.6, 0.0, 6.5, 2.5, 3.2, 0.0]

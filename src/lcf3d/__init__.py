@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from lcf3d.distortion import Distortion
 from lcf3d.errors import Lcf3dError
+from lcf3d.frame import Frame
 from lcf3d.structures import (
     ARGOVERSE_CLASSES,
     KITTI_CLASSES,
@@ -15,7 +16,6 @@ from lcf3d.structures import (
     Camera,
     Detections2D,
     Detections3D,
-    Frame,
     InstanceMask,
 )
 
@@ -52,7 +52,8 @@ if TYPE_CHECKING:
     from lcf3d.localizers.geometric import GeometricLocalizer
     from lcf3d.localizers.named import load_localizer
     from lcf3d.localizers.shapes import SHAPES, ObjectShape
-    from lcf3d.provenance import FusedDetections, Outcome, Reason
+    from lcf3d.provenance import FusedDetections
+    from lcf3d.reasons import Outcome, Reason
     from lcf3d.simulation.frames import simulate_drive, simulate_frame
 
 try:
@@ -83,8 +84,8 @@ _LAZY = {
     "KittiDataset": "datasets.kitti",
     "LateCascadeFusion": "fusion.pipeline",
     "NuscenesDataset": "datasets.nuscenes",
-    "Outcome": "provenance",
-    "Reason": "provenance",
+    "Outcome": "reasons",
+    "Reason": "reasons",
     "StereoConfig": "fusion.stereo",
     "StereoLateCascadeFusion": "fusion.stereo",
     "DOMAINS": "evaluation.domain_shift",

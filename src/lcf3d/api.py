@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lcf3d.errors import ConfigError
+from lcf3d.frame import Frame
 from lcf3d.provenance import FusedDetections
-from lcf3d.structures import Detections2D, Detections3D, Frame
+from lcf3d.structures import Detections2D, Detections3D
 
 if TYPE_CHECKING:
     from PIL import Image

@@ -11,8 +11,7 @@ Conventions (all of the package, converted only at its edges, see ``lcf3d.geomet
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from copy import copy
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, TypeVar
@@ -53,7 +52,7 @@ ARGOVERSE_CLASSES = (
 # fmt: on
 
 
-def _array(value: ArrayLike, dtype: Any, shape: tuple[int | None, ...], what: str) -> NDArray[Any]:
+def checked_array(value: ArrayLike, dtype: Any, shape: tuple[int | None, ...], what: str) -> NDArray[Any]:
     """``value`` as a read-only array of ``dtype``; ``None`` in ``shape`` is any length; empty input is accepted."""
     if hasattr(value, "detach"):
         # a tensor of torch, which may be on a GPU and want a gradient
@@ -98,8 +97,8 @@ class Camera:
     pixels_from_lidar: FloatArray = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        projection = _array(self.projection, np.float64, (3, 4), "Camera.projection")
-        transform = _array(self.camera_from_lidar, np.float64, (4, 4), "Camera.camera_from_lidar")
+        projection = checked_array(self.projection, np.float64, (3, 4), "Camera.projection")
+        transform = checked_array(self.camera_from_lidar, np.float64, (4, 4), "Camera.camera_from_lidar")
         if not (np.isfinite(projection).all() and np.isfinite(transform).all()):
             raise ConfigError(f"calibration of camera {self.name!r} holds NaN or infinite values")
         if self.width <= 0 or self.height <= 0:
@@ -189,7 +188,7 @@ class Detections3D(Converters3D):
             value = getattr(self, name)
             if value is not None:
                 dtype = np.float64 if name == "velocities" else np.str_
-                object.__setattr__(self, name, _array(value, dtype, shape, f"Detections3D.{name}"))
+                object.__setattr__(self, name, checked_array(value, dtype, shape, f"Detections3D.{name}"))
 
     @classmethod
     def trusted(
@@ -343,111 +342,6 @@ class Detections2D(Converters2D):
         return with_columns(self[kept], labels=labels, class_names=tuple(class_names))
 
 
-@dataclass(frozen=True, eq=False)
-class Sweep:
-    """One LiDAR sweep before the key frame.
-
-    Attributes:
-        points: (N, 4 or more) ``x, y, z, intensity, ...`` in the LiDAR frame at the moment of the sweep.
-        lidar_from_sweep: (4, 4) LiDAR coordinates of the key frame from those of the sweep.
-        time_lag_s: seconds from the sweep to the key frame, positive for the past.
-    """
-
-    points: NDArray[np.floating]
-    lidar_from_sweep: FloatArray
-    time_lag_s: float
-
-
-class Frame:
-    """What the sensors saw at one moment; parts that are read from disk are read when first asked for.
-
-    Args:
-        id: name of the frame, unique in its dataset.
-        points: (N, 4 or more) float32 ``x, y, z, intensity, ...`` in the LiDAR frame, a function that returns them,
-            or None without a scan.
-        cameras: the calibrated cameras, of different names.
-        images: (H, W, 3) uint8 RGB image by camera name (a mapping that may load on access); cameras may be missing.
-        labels: ground truth (scores 1), a function that returns it, or None.
-        timestamp: moment of the scan in seconds, of any clock that the frames of a drive share; None if unknown.
-        world_from_lidar: (4, 4) pose of the LiDAR frame in a frame that does not move; None if unknown.
-        sequence: name of the drive that the frame is a moment of; None if it stands alone.
-        sweeps: a function that reads at most so many sweeps before the scan, the latest first; None where there are
-            none (see `Sweep`).
-    """
-
-    def __init__(
-        self,
-        id: str,
-        points: NDArray[np.float32] | Callable[[], NDArray[np.float32]] | None = None,
-        cameras: Sequence[Camera] = (),
-        images: Mapping[str, NDArray[np.uint8]] | None = None,
-        labels: Detections3D | Callable[[], Detections3D] | None = None,
-        timestamp: float | None = None,
-        world_from_lidar: FloatArray | None = None,
-        sequence: str | None = None,
-        sweeps: Callable[[int], Sequence[Sweep]] | None = None,
-    ) -> None:
-        self.id = id
-        self._sweeps = sweeps
-        self._sweeps_read: tuple[int, tuple[Sweep, ...]] | None = None
-        self.timestamp = timestamp
-        self.sequence = sequence
-        self.world_from_lidar = (
-            None if world_from_lidar is None else _array(world_from_lidar, np.float64, (4, 4), "Frame.world_from_lidar")
-        )
-        self.cameras = tuple(cameras)
-        self.images: Mapping[str, NDArray[np.uint8]] = {} if images is None else images
-        self._points = points
-        self._labels = labels
-        names = [camera.name for camera in self.cameras]
-        if len(set(names)) != len(names):
-            raise ConfigError(f"frame {id}: camera names must differ, got {names}")
-
-    @property
-    def points(self) -> NDArray[np.float32] | None:
-        """(N, 4 or more) float32 points in the LiDAR frame, or None without a scan."""
-        if callable(self._points):
-            self._points = self._points()
-        if self._points is not None and (self._points.ndim != 2 or self._points.shape[1] < 4):
-            raise ShapeError(f"frame {self.id}: points must have shape (N, 4 or more), got {self._points.shape}")
-        return self._points
-
-    def sweeps(self, count: int) -> Sequence[Sweep]:
-        """At most ``count`` LiDAR sweeps before the scan, the latest first; those read last are kept."""
-        if self._sweeps is None or count < 1:
-            return ()
-        if self._sweeps_read is None or self._sweeps_read[0] != count:
-            self._sweeps_read = (count, tuple(self._sweeps(count)))
-        return self._sweeps_read[1]
-
-    @property
-    def labels(self) -> Detections3D | None:
-        """Ground truth in the LiDAR frame, or None without it."""
-        if callable(self._labels):
-            self._labels = self._labels()
-        return self._labels
-
-    def camera(self, name: str) -> Camera:
-        """The camera of that name.
-
-        Raises:
-            ConfigError: there is none.
-        """
-        for camera in self.cameras:
-            if camera.name == name:
-                return camera
-        raise ConfigError(f"frame {self.id} has no camera {name!r}; it has {[c.name for c in self.cameras]}")
-
-    def with_cameras(self, cameras: Sequence[Camera]) -> Frame:
-        """The same frame with other cameras; scan, images and labels are those of this one, read when asked for."""
-        frame = copy(self)
-        frame.cameras = tuple(cameras)
-        return frame
-
-    def __repr__(self) -> str:
-        return f"Frame({self.id!r}, cameras={[c.name for c in self.cameras]})"
-
-
 def _trusted(kind: type[Detections], **columns: Any) -> Detections:
     """Detections of arrays that are known to be right, see `Detections3D.trusted`."""
     made = object.__new__(kind)
@@ -466,10 +360,10 @@ def with_columns(detections: Detections, **columns: Any) -> Detections:
 def _validate(detections: Detections2D | Detections3D, box_shape: tuple[int | None, int]) -> None:
     """Convert and check the parallel arrays of a detections object in place."""
     kind = type(detections).__name__
-    boxes = _array(detections.boxes, np.float64, box_shape, f"{kind}.boxes")
+    boxes = checked_array(detections.boxes, np.float64, box_shape, f"{kind}.boxes")
     n = len(boxes)
-    scores = _array(detections.scores, np.float64, (None,), f"{kind}.scores")
-    labels = _array(detections.labels, np.int64, (None,), f"{kind}.labels")
+    scores = checked_array(detections.scores, np.float64, (None,), f"{kind}.scores")
+    labels = checked_array(detections.labels, np.int64, (None,), f"{kind}.labels")
     if len(scores) != n or len(labels) != n:
         raise ShapeError(f"{kind} has {n} boxes but {len(scores)} scores and {len(labels)} labels")
     class_names = tuple(detections.class_names)

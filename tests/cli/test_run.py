@@ -10,7 +10,7 @@ from lcf3d.formats.kitti import objects_from_detections_2d, read_objects, write_
 from lcf3d.fusion.config import PRESETS
 from lcf3d.geometry.camera import project_boxes
 from lcf3d.localizers.named import SHIPPED
-from lcf3d.provenance import Outcome
+from lcf3d.reasons import Outcome
 from lcf3d.run.folder import RunFolder
 from lcf3d.structures import KITTI_CLASSES, Detections2D
 from tests.datasets.kitti_folder import LABELS, make_kitti, make_results

@@ -14,10 +14,11 @@ from lcf3d.datasets.nuscenes import NuscenesDataset
 from lcf3d.datasets.nuscenes_tables import CAMERAS
 from lcf3d.formats.coco import encode_mask
 from lcf3d.formats.nuscenes import read_submission
+from lcf3d.frame import Frame
 from lcf3d.geometry.camera import project_boxes
-from lcf3d.provenance import Outcome
+from lcf3d.reasons import Outcome
 from lcf3d.run.folder import RunFolder
-from lcf3d.structures import NUSCENES_CLASSES, Detections3D, Frame
+from lcf3d.structures import NUSCENES_CLASSES, Detections3D
 from tests.fusion.scenes import camera, surface_points
 
 DEMO = "ca9a282c9e77460f8360f564131a8af5"

@@ -12,7 +12,8 @@ from lcf3d.cli.app import app
 from lcf3d.datasets.kitti import KittiDataset
 from lcf3d.errors import ConfigError, DatasetError
 from lcf3d.fusion.config import FusionConfig
-from lcf3d.provenance import Decisions, FusedDetections, Outcome, Reason
+from lcf3d.provenance import Decisions, FusedDetections
+from lcf3d.reasons import Outcome, Reason
 from lcf3d.run.folder import RunFolder
 from lcf3d.structures import KITTI_CLASSES, Detections2D, Detections3D
 from lcf3d.visualization.scene import COLOURS

@@ -9,9 +9,10 @@ from lcf3d.datasets.opening import open_dataset
 from lcf3d.errors import DatasetError, FormatError
 from lcf3d.formats.argoverse import read_submission
 from lcf3d.formats.feather import write_columns
+from lcf3d.frame import Frame
 from lcf3d.fusion.config import FusionConfig
 from lcf3d.fusion.pipeline import LateCascadeFusion
-from lcf3d.structures import ARGOVERSE_CLASSES, Detections2D, Detections3D, Frame
+from lcf3d.structures import ARGOVERSE_CLASSES, Detections2D, Detections3D
 from tests.datasets.argoverse_log import (
     CUBOID,
     LOG,

@@ -21,9 +21,10 @@ from lcf3d.distortion import Distortion
 from lcf3d.errors import ConfigError, DatasetError, FormatError
 from lcf3d.formats import ros_messages as ros
 from lcf3d.formats.bag_files import BagReader, BagWriter
+from lcf3d.frame import Frame
 from lcf3d.geometry.camera import project_boxes, project_points
 from lcf3d.geometry.rotation import invert_rigid
-from lcf3d.structures import Camera, Detections2D, Detections3D, Frame
+from lcf3d.structures import Camera, Detections2D, Detections3D
 from tests.datasets.plain_folder import CLASSES, POSES, boxes_of, camera, scan_of, write_plain_folder
 
 FORMS = ("drive.mcap", "drive.bag", "drive")

@@ -9,8 +9,9 @@ from lcf3d.datasets.nuscenes import NuscenesDataset
 from lcf3d.datasets.nuscenes_check import check_nuscenes
 from lcf3d.errors import ConfigError
 from lcf3d.formats.kitti import read_objects
+from lcf3d.frame import Frame
 from lcf3d.geometry.camera import project_boxes
-from lcf3d.structures import KITTI_CLASSES, NUSCENES_CLASSES, Camera, Detections3D, Frame
+from lcf3d.structures import KITTI_CLASSES, NUSCENES_CLASSES, Camera, Detections3D
 
 # a stereo camera's projection with a baseline, mounted with a tilt
 PROJECTION = np.array([[700.0, 0, 620, 45], [0, 700, 190, 0.2], [0, 0, 1, 0.003]])

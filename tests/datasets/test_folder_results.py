@@ -11,7 +11,8 @@ from lcf3d.errors import DatasetError
 from lcf3d.files import write_json
 from lcf3d.formats import coco
 from lcf3d.formats.kitti import write_objects
-from lcf3d.structures import Detections2D, Detections3D, Frame
+from lcf3d.frame import Frame
+from lcf3d.structures import Detections2D, Detections3D
 from tests.datasets.plain_folder import camera
 
 CLASSES = ("car", "pedestrian")

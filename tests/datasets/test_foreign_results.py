@@ -10,8 +10,9 @@ from lcf3d.datasets.base import BaseDataset
 from lcf3d.datasets.foreign_results import ForeignLidarResults, is_foreign
 from lcf3d.datasets.nuscenes import RAW_FROM_CANONICAL
 from lcf3d.errors import ConfigError, DatasetError, FormatError, Lcf3dError
+from lcf3d.frame import Frame
 from lcf3d.run.results import lidar_results
-from lcf3d.structures import KITTI_CLASSES, Frame
+from lcf3d.structures import KITTI_CLASSES
 
 CAR = [10.0, 2.0, -0.9, 4.0, 1.8, 1.6, 0.5]
 IDS = ("000001", "000002")

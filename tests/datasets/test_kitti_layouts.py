@@ -8,8 +8,8 @@ from lcf3d.datasets.kitti_layouts import KittiOdometryDataset, KittiRawDataset, 
 from lcf3d.datasets.opening import open_dataset
 from lcf3d.errors import ConfigError, DatasetError, FormatError
 from lcf3d.formats.kitti_drives import EARTH_RADIUS_M
+from lcf3d.frame import Frame
 from lcf3d.geometry.boxes import points_in_boxes
-from lcf3d.structures import Frame
 from tests.datasets.kitti_drives import (
     RAW,
     STEP_DEGREES,

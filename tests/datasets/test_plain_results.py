@@ -8,7 +8,8 @@ from lcf3d.datasets import plain_results
 from lcf3d.datasets.plain_results import PlainCameraResults, PlainLidarResults
 from lcf3d.errors import DatasetError
 from lcf3d.formats.plain import write_detections_2d
-from lcf3d.structures import Detections2D, Detections3D, Frame
+from lcf3d.frame import Frame
+from lcf3d.structures import Detections2D, Detections3D
 from tests.datasets.plain_folder import CLASSES, boxes_of, camera
 
 IDS = ("f0", "f1")

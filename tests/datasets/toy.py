@@ -6,8 +6,9 @@ from pathlib import Path
 import numpy as np
 
 from lcf3d.datasets.base import BaseDataset, require_folder
+from lcf3d.frame import Frame
 from lcf3d.geometry.camera import project_boxes
-from lcf3d.structures import Camera, Detections2D, Detections3D, Frame
+from lcf3d.structures import Camera, Detections2D, Detections3D
 
 CLASSES = ("car", "person")
 FRONT = Camera(

@@ -8,7 +8,7 @@ from lcf3d.cli.app import app
 from lcf3d.datasets.drive import beam_numbers, every_beam, read_drive
 from lcf3d.demo.drive import FULL, LIDAR_ALONE, LIDARS, VARIANTS, drive, ground_truth, measure, shipped_detectors
 from lcf3d.geometry.boxes import points_in_boxes
-from lcf3d.provenance import Outcome
+from lcf3d.reasons import Outcome
 
 
 @pytest.fixture(scope="module")

@@ -16,8 +16,9 @@ import numpy as np
 from PIL import Image
 
 from lcf3d import Detections2D, Detections3D, FusionConfig, LateCascadeFusion, NuscenesDataset, run, write_nuscenes
+from lcf3d.frame import Frame
 from lcf3d.geometry.camera import project_boxes
-from lcf3d.structures import KITTI_CLASSES, NUSCENES_CLASSES, Frame
+from lcf3d.structures import KITTI_CLASSES, NUSCENES_CLASSES
 from tests.datasets.argoverse_log import FIRST_NS, LOG, cuboid, sweep_time, write_log, write_submission_rows
 from tests.datasets.kitti_drives import make_raw, make_tracking
 from tests.datasets.kitti_folder import OBJECTS, SIZE, ground, left_camera, make_kitti, make_results, right_camera

@@ -29,9 +29,10 @@ from lcf3d.evaluation.domain_shift import (
 )
 from lcf3d.evaluation.domain_tasks import DomainTask, DomainTaskRunner, parse_task
 from lcf3d.evaluation.svg import PALETTE
+from lcf3d.frame import Frame
 from lcf3d.fusion.config import FusionConfig
 from lcf3d.geometry.camera import project_points
-from lcf3d.structures import KITTI_CLASSES, NUSCENES_CLASSES, Detections3D, Frame
+from lcf3d.structures import KITTI_CLASSES, NUSCENES_CLASSES, Detections3D
 from tests.datasets.kitti_folder import OBJECTS, make_kitti, make_results
 from tests.fusion.scenes import camera
 

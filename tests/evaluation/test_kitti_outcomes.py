@@ -9,7 +9,8 @@ from lcf3d.evaluation.kitti import KittiEvaluator, Selection
 from lcf3d.evaluation.kitti_outcomes import fusion_outcomes, read_provenance, working_point
 from lcf3d.evaluation.kitti_study import study
 from lcf3d.geometry.boxes import lidar_from_kitti
-from lcf3d.provenance import Decisions, FusedDetections, Outcome, Reason
+from lcf3d.provenance import Decisions, FusedDetections
+from lcf3d.reasons import Outcome, Reason
 from lcf3d.structures import Detections2D, Detections3D
 
 from .kitti_frames import frames

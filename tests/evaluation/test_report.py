@@ -21,7 +21,8 @@ from lcf3d.evaluation.report import html_report
 from lcf3d.evaluation.report_data import OUTCOMES, report_data
 from lcf3d.evaluation.study import ClassStudy, FusionOutcomes, Study
 from lcf3d.evaluation.svg import Line, line_chart
-from lcf3d.structures import Camera, Frame
+from lcf3d.frame import Frame
+from lcf3d.structures import Camera
 
 from .kitti_frames import frames
 

@@ -5,7 +5,8 @@ from dataclasses import fields
 import numpy as np
 import pytest
 
-from lcf3d.provenance import OUTCOMES, REASONS, Decisions, FusedDetections, TrackTable
+from lcf3d.provenance import Decisions, FusedDetections, TrackTable
+from lcf3d.reasons import OUTCOMES, REASONS
 from lcf3d.structures import Detections2D, Detections3D
 
 pyarrow = pytest.importorskip("pyarrow", reason="needs pyarrow: pip install 'lcf3d[fleet]'")

@@ -2,9 +2,10 @@
 
 import numpy as np
 
+from lcf3d.frame import Frame
 from lcf3d.geometry.boxes import box_corners
 from lcf3d.geometry.camera import project_boxes
-from lcf3d.structures import KITTI_CLASSES, Camera, Detections2D, Detections3D, Frame
+from lcf3d.structures import KITTI_CLASSES, Camera, Detections2D, Detections3D
 
 CAR, PEDESTRIAN, CYCLIST = range(3)
 

@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from lcf3d.distortion import Distortion
 from lcf3d.errors import ConfigError
+from lcf3d.frame import Frame
 from lcf3d.fusion.alignment import (
     DISPLACEMENT,
     TIME,
@@ -21,7 +22,7 @@ from lcf3d.fusion.alignment import (
 from lcf3d.fusion.alignment_matching import Sighting, vote_rotation
 from lcf3d.fusion.alignment_watch import AlignmentWatch, WatchSettings, estimate, judge
 from lcf3d.geometry.camera import project_boxes, project_points
-from lcf3d.structures import Camera, Detections2D, Frame
+from lcf3d.structures import Camera, Detections2D
 from tests.fusion.scenes import CAR, PEDESTRIAN, camera, car, lidar, pedestrian
 
 NAMES = ("Car", "Pedestrian", "Cyclist")

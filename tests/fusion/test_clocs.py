@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from lcf3d.errors import FormatError
+from lcf3d.frame import Frame
 from lcf3d.fusion.clocs import FARTHEST_M, WIDTHS, ClocsFusion, ClocsNetwork, Pairs, ScoreScale, find_pairs
 from lcf3d.geometry.camera import project_boxes
-from lcf3d.structures import KITTI_CLASSES, Detections2D, Detections3D, Frame
+from lcf3d.structures import KITTI_CLASSES, Detections2D, Detections3D
 from tests.evaluation.drive import VIEW
 
 SCALE = ScoreScale("identity", 1.0, 2.0)

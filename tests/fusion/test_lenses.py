@@ -13,7 +13,7 @@ from lcf3d.fusion.stereo_pairing import believable_pairs, curve_costs, epipolar_
 from lcf3d.geometry.camera import project_boxes, project_points
 from lcf3d.geometry.epipolar import fundamental_matrix
 from lcf3d.geometry.iou import bev_iou
-from lcf3d.provenance import Outcome
+from lcf3d.reasons import Outcome
 from lcf3d.structures import InstanceMask
 from tests.fusion.scenes import camera, car, lidar, seen
 from tests.fusion.stereo_scenes import boxes2d, moved

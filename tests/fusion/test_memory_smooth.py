@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from lcf3d.frame import Frame
 from lcf3d.fusion.memory import remember_sequence
 from lcf3d.fusion.memory_smooth import smooth_sequence
-from lcf3d.structures import Frame
 
 from .scenes import car
 from .test_memory import drive, frame, fused

@@ -4,7 +4,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lcf3d import FusionConfig, LateCascadeFusion, Lcf3dError
-from lcf3d.provenance import FusedDetections, Outcome, Reason
+from lcf3d.provenance import FusedDetections
+from lcf3d.reasons import Outcome, Reason
 from lcf3d.structures import KITTI_CLASSES, Detections2D, Detections3D
 from tests.fusion.scenes import (
     CAR,

@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from lcf3d.frame import Frame
 from lcf3d.fusion.config import FusionConfig
 from lcf3d.fusion.pipeline import LateCascadeFusion
-from lcf3d.provenance import Outcome, Reason
-from lcf3d.structures import KITTI_CLASSES, Detections2D, Detections3D, Frame
+from lcf3d.reasons import Outcome, Reason
+from lcf3d.structures import KITTI_CLASSES, Detections2D, Detections3D
 from tests.datasets.kitti_folder import LABELS, OBJECTS, left_camera
 
 

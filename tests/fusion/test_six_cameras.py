@@ -7,10 +7,11 @@ import pytest
 
 from lcf3d import FusionConfig, LateCascadeFusion
 from lcf3d.datasets.nuscenes import NuscenesDataset
+from lcf3d.frame import Frame
 from lcf3d.geometry.camera import project_boxes
 from lcf3d.geometry.iou import image_area
-from lcf3d.provenance import Outcome, Reason
-from lcf3d.structures import KITTI_CLASSES, Camera, Detections2D, Frame
+from lcf3d.reasons import Outcome, Reason
+from lcf3d.structures import KITTI_CLASSES, Camera, Detections2D
 from tests.fusion.scenes import CAR, PLAIN, TrueLocalizer, camera, car, lidar, surface_points
 
 DEMO = "ca9a282c9e77460f8360f564131a8af5"

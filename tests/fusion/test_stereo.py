@@ -9,7 +9,8 @@ from lcf3d import Lcf3dError
 from lcf3d.fusion.frustum import extract_frustums
 from lcf3d.fusion.stereo import StereoConfig, StereoLateCascadeFusion
 from lcf3d.geometry.camera import project_points
-from lcf3d.provenance import FusedDetections, Outcome, Reason
+from lcf3d.provenance import FusedDetections
+from lcf3d.reasons import Outcome, Reason
 from lcf3d.structures import KITTI_CLASSES, Detections2D, InstanceMask
 from tests.fusion.scenes import (
     CAR,

@@ -11,7 +11,7 @@ from lcf3d.fusion.stereo import StereoConfig, StereoLateCascadeFusion
 from lcf3d.fusion.stereo_pairing import epipolar_costs
 from lcf3d.geometry.epipolar import fundamental_matrix
 from lcf3d.geometry.iou import iou_3d
-from lcf3d.provenance import Outcome
+from lcf3d.reasons import Outcome
 from lcf3d.structures import KITTI_CLASSES, Detections3D
 from tests.fusion.scenes import PLAIN
 

@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from lcf3d.structures import KITTI_CLASSES, Detections2D, Detections3D, Frame
+from lcf3d.frame import Frame
+from lcf3d.structures import KITTI_CLASSES, Detections2D, Detections3D
 from tests.fuzz.mutations import mutate_bytes, mutate_json
 from tests.fuzz.reader import BOXES, Reader, call
 

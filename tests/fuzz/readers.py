@@ -32,9 +32,9 @@ def _detections() -> Detections3D:
 
 
 def _provenance(path: Path) -> None:
+    from lcf3d.frame import Frame
     from lcf3d.fusion.config import FusionConfig
     from lcf3d.fusion.pipeline import LateCascadeFusion
-    from lcf3d.structures import Frame
     from tests.datasets.kitti_folder import left_camera
 
     found = Detections2D(np.array([[500.0, 150, 600, 220]]), np.array([0.8]), np.array([0]), KITTI_CLASSES)

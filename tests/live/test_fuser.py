@@ -6,11 +6,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lcf3d.errors import ConfigError
+from lcf3d.frame import Frame
 from lcf3d.fusion.alignment import realigned
 from lcf3d.fusion.alignment_watch import WatchSettings
 from lcf3d.live.messages import CameraBoxes, CameraModel, EgoPose, Image, LidarBoxes, Scan
 from lcf3d.live.synchronizer import SyncSettings
-from lcf3d.structures import Frame
 from tests.fusion.scenes import camera
 from tests.live.streams import boxes2d, boxes3d, fingerprint, fuser, fusion, pose, run, stream, street
 

@@ -3,10 +3,11 @@ import pytest
 
 from lcf3d.datasets.base import BaseDataset
 from lcf3d.errors import DatasetError
+from lcf3d.frame import Frame
 from lcf3d.fusion.alignment import realigned
 from lcf3d.geometry.camera import project_boxes
 from lcf3d.run.alignment import aligned_frame, alignment_findings, describe, find_alignment
-from lcf3d.structures import Detections2D, Detections3D, Frame
+from lcf3d.structures import Detections2D, Detections3D
 from tests.fusion.scenes import camera
 from tests.fusion.test_alignment import NAMES, street
 

@@ -5,11 +5,12 @@ from types import SimpleNamespace
 import numpy as np
 
 from lcf3d.detectors.base import CloudRequest
+from lcf3d.frame import Frame, Sweep
 from lcf3d.fusion.config import FusionConfig
 from lcf3d.fusion.pipeline import LateCascadeFusion
 from lcf3d.run.frames import FrameRunner
 from lcf3d.run.sources import LidarOnScans
-from lcf3d.structures import Detections3D, Frame, Sweep
+from lcf3d.structures import Detections3D
 
 SCAN = np.array([[10.0, 0, 0, 1], [12, 1, 0, 1]], np.float32)
 

@@ -3,8 +3,8 @@
 import pytest
 
 from lcf3d.errors import DatasetError
+from lcf3d.frame import Frame
 from lcf3d.run.sequences import in_order, pending
-from lcf3d.structures import Frame
 
 
 class Frames:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from lcf3d.frame import Frame
 from lcf3d.run import sources
-from lcf3d.structures import Detections3D, Frame
+from lcf3d.structures import Detections3D
 
 EMPTY = Detections3D.empty(("Car",))
 

@@ -11,10 +11,11 @@ from hypothesis import strategies as st
 
 from lcf3d.distortion import Distortion
 from lcf3d.errors import ConfigError
+from lcf3d.frame import Frame
 from lcf3d.geometry.boxes import bev_corners
 from lcf3d.geometry.camera import NEAR, project_boxes
 from lcf3d.provenance import FusedDetections
-from lcf3d.structures import Camera, Detections2D, Detections3D, Frame
+from lcf3d.structures import Camera, Detections2D, Detections3D
 from lcf3d.visualization.bev import BevView, draw_bev
 from lcf3d.visualization.camera_view import draw_camera, projected_edges, scaled_camera
 from lcf3d.visualization.canvas import clip_segments

@@ -8,8 +8,9 @@ import pytest
 
 from lcf3d import FusionConfig, LateCascadeFusion
 from lcf3d.errors import MissingExtraError
+from lcf3d.frame import Frame
 from lcf3d.fusion.memory import remember_sequence
-from lcf3d.structures import Frame, InstanceMask
+from lcf3d.structures import InstanceMask
 from lcf3d.visualization.rerun_log import RerunLog, point_colours
 from lcf3d.visualization.scene import COLOURS, Scene
 from tests.fusion.scenes import camera, car, lidar, seen

@@ -6,7 +6,7 @@ import PIL.Image
 import pytest
 
 from lcf3d.fusion.memory import remember_sequence
-from lcf3d.provenance import Outcome
+from lcf3d.reasons import Outcome
 from lcf3d.visualization.bev import BevView, draw_bev
 from lcf3d.visualization.png import GIF_MS, save_gif
 from lcf3d.visualization.scene import COLOURS, Scene

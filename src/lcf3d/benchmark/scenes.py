@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from lcf3d.frame import Frame
 from lcf3d.geometry.camera import project_boxes
-from lcf3d.structures import KITTI_CLASSES, Camera, Detections2D, Detections3D, Frame
+from lcf3d.structures import KITTI_CLASSES, Camera, Detections2D, Detections3D
 
 # KITTI's left colour camera, ideal mounting
 PROJECTION = np.array([[721.5, 0, 609.6, 44.9], [0, 721.5, 172.9, 0.2], [0, 0, 1, 0.003]])

@@ -112,7 +112,7 @@ def _examples(result: DemoResult) -> list[str]:
     """Sentences on matched, recovered and doubted boxes of the frame with most recovered ones."""
     import numpy as np
 
-    from lcf3d.provenance import Outcome
+    from lcf3d.reasons import Outcome
 
     item = max(result.frames, key=lambda f: int((f.fused.outcomes == Outcome.RECOVERED).sum()))
     outcomes = (Outcome.MATCHED, Outcome.RECOVERED, Outcome.KEPT)

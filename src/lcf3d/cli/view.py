@@ -12,7 +12,7 @@ from lcf3d.errors import ConfigError, DatasetError
 
 if TYPE_CHECKING:
     from lcf3d.datasets.base import CameraSource, Dataset, LidarSource
-    from lcf3d.structures import Frame
+    from lcf3d.frame import Frame
     from lcf3d.visualization.scene import Scene
 
 

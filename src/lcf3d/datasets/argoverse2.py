@@ -25,8 +25,9 @@ from lcf3d.datasets.check import Finding
 from lcf3d.datasets.images import ImageFiles
 from lcf3d.errors import DatasetError
 from lcf3d.formats.argoverse import Cuboids, read_sweep
+from lcf3d.frame import Frame
 from lcf3d.geometry.rotation import invert_rigid
-from lcf3d.structures import ARGOVERSE_CLASSES, Camera, FloatArray, Frame
+from lcf3d.structures import ARGOVERSE_CLASSES, Camera, FloatArray
 
 RING_CAMERAS = (
     "ring_front_center",

@@ -14,7 +14,8 @@ from lcf3d.datasets.argoverse2_results import ArgoverseLidarResults, result_file
 from lcf3d.datasets.check import Finding, check_frames
 from lcf3d.errors import Lcf3dError
 from lcf3d.formats.argoverse import read_submission
-from lcf3d.structures import ARGOVERSE_CLASSES, Frame
+from lcf3d.frame import Frame
+from lcf3d.structures import ARGOVERSE_CLASSES
 
 RULES = {
     "ARG01": "calibration, poses and annotations of every log can be read",

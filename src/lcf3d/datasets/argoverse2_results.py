@@ -10,8 +10,9 @@ from lcf3d.datasets.argoverse2_frames import detections_by_frame, id_of, results
 from lcf3d.detectors.joins import LeftOut, join_classes
 from lcf3d.errors import DatasetError
 from lcf3d.formats.argoverse import read_submission, write_submission
+from lcf3d.frame import Frame
 from lcf3d.provenance import FusedDetections
-from lcf3d.structures import ARGOVERSE_CLASSES, Detections3D, Frame
+from lcf3d.structures import ARGOVERSE_CLASSES, Detections3D
 
 FILE_NAME = "results.feather"
 

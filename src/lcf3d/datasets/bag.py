@@ -30,9 +30,10 @@ from lcf3d.formats.ros_objects import (
     detections_2d_of,
     detections_3d_of,
 )
+from lcf3d.frame import Frame
 from lcf3d.geometry.boxes import transform_boxes
 from lcf3d.geometry.rotation import invert_rigid
-from lcf3d.structures import KITTI_CLASSES, Camera, Detections2D, Detections3D, FloatArray, Frame
+from lcf3d.structures import KITTI_CLASSES, Camera, Detections2D, Detections3D, FloatArray
 
 # what the last parts of image topics are called; what is before them is the camera
 _IMAGE_PARTS = (

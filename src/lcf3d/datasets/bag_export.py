@@ -12,9 +12,10 @@ import numpy as np
 from lcf3d.datasets.folder_export import pose_without_offset
 from lcf3d.formats import ros_messages as ros
 from lcf3d.formats.bag_files import BagWriter
+from lcf3d.frame import Frame
 from lcf3d.geometry.rotation import invert_rigid, quaternions_from_matrices, quaternions_from_yaws
 from lcf3d.provenance import FusedDetections
-from lcf3d.structures import Camera, Detections2D, Detections3D, FloatArray, Frame
+from lcf3d.structures import Camera, Detections2D, Detections3D, FloatArray
 
 LIDAR, WORLD = "lidar", "world"
 POINTS, OBJECTS, LABELS = "/lidar/points", "/lidar/objects", "/labels"

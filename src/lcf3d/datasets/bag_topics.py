@@ -8,7 +8,8 @@ from lcf3d.datasets.bag import BagDataset
 from lcf3d.datasets.base import CameraSource, Dataset, LidarSource
 from lcf3d.errors import ConfigError, DatasetError
 from lcf3d.formats.ros_objects import OBJECTS_2D, OBJECTS_3D
-from lcf3d.structures import Detections2D, Detections3D, Frame
+from lcf3d.frame import Frame
+from lcf3d.structures import Detections2D, Detections3D
 
 
 class LidarTopic:

@@ -18,8 +18,9 @@ from typing import Protocol
 
 from lcf3d.datasets.check import Finding, check_frames
 from lcf3d.errors import ConfigError, DatasetError
+from lcf3d.frame import Frame
 from lcf3d.provenance import FusedDetections
-from lcf3d.structures import Detections2D, Detections3D, FloatArray, Frame
+from lcf3d.structures import Detections2D, Detections3D, FloatArray
 
 MISSING = ("error", "empty")
 """What may be done about result files that are not there: refuse them, or take them as frames without detections."""

@@ -10,9 +10,9 @@ from typing import Literal, Protocol
 import numpy as np
 
 from lcf3d.errors import Lcf3dError
+from lcf3d.frame import Frame
 from lcf3d.geometry.boxes import points_in_boxes
 from lcf3d.geometry.camera import project_boxes
-from lcf3d.structures import Frame
 
 RULES = {
     "FRM01": "every frame can be read",

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lcf3d.datasets.base import Dataset
-from lcf3d.structures import Detections3D, Frame
+from lcf3d.frame import Frame
+from lcf3d.structures import Detections3D
 from lcf3d.visualization.png import draw_frame
 from lcf3d.visualization.points import paint_points
 from lcf3d.visualization.scene import Scene

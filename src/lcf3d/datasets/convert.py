@@ -21,11 +21,12 @@ from lcf3d.errors import ConfigError
 from lcf3d.files import atomic_path, write_json, write_text
 from lcf3d.formats.kitti import KittiObjects, objects_from_detections, write_objects
 from lcf3d.formats.nuscenes_boxes import NUSCENES_ATTRIBUTES, global_from_detections
+from lcf3d.frame import Frame
 from lcf3d.geometry.boxes import points_in_boxes
 from lcf3d.geometry.camera import project_boxes, require_pinhole
 from lcf3d.geometry.iou import image_area
 from lcf3d.geometry.rotation import invert_rigid, quaternions_from_matrices
-from lcf3d.structures import NUSCENES_CLASSES, Camera, Detections3D, FloatArray, Frame
+from lcf3d.structures import NUSCENES_CLASSES, Camera, Detections3D, FloatArray
 
 KITTI_NAMES = ("Car", "Truck", "Pedestrian", "Cyclist")
 """Classes that `kitti_labels` gives."""

@@ -21,8 +21,9 @@ from lcf3d.datasets.folder_sensors import CANONICAL_AXES, FILE, Sensors, read_by
 from lcf3d.datasets.images import ImageFiles, image_size
 from lcf3d.errors import DatasetError
 from lcf3d.formats.point_files import SUFFIXES, read_scan
+from lcf3d.frame import Frame, Sweep
 from lcf3d.geometry.rotation import invert_rigid, rigid_transforms
-from lcf3d.structures import Camera, Detections3D, FloatArray, Frame, Sweep
+from lcf3d.structures import Camera, Detections3D, FloatArray
 
 # name of a sensor, folder and suffixes of its files, and where they are kept
 _Files = tuple[str, Path, tuple[str, ...], dict[str, dict[str, Path]]]

@@ -26,9 +26,10 @@ from lcf3d.datasets.folder_poses import (
 from lcf3d.datasets.folder_results import KITTI, FolderLabels
 from lcf3d.datasets.folder_sensors import Sensors, canonical_from_axes
 from lcf3d.errors import DatasetError, Lcf3dError
+from lcf3d.frame import Frame
 from lcf3d.geometry.boxes import transform_boxes
 from lcf3d.geometry.rotation import invert_rigid
-from lcf3d.structures import Camera, FloatArray, Frame
+from lcf3d.structures import Camera, FloatArray
 
 RULES = {
     "FLD01": "every file of every sensor belongs to a frame",

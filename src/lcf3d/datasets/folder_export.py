@@ -12,8 +12,9 @@ from lcf3d.datasets.folder_sensors import FILE, CameraSetup, Lens, LidarSetup, S
 from lcf3d.errors import ConfigError
 from lcf3d.files import atomic_path, write_text
 from lcf3d.formats.plain import write_detections_3d
+from lcf3d.frame import Frame
 from lcf3d.geometry.rotation import quaternions_from_matrices
-from lcf3d.structures import Camera, FloatArray, Frame
+from lcf3d.structures import Camera, FloatArray
 
 
 def write_folder(

@@ -25,8 +25,9 @@ from lcf3d.formats.coco import (
 from lcf3d.formats.kitti import detections_3d, read_objects
 from lcf3d.formats.plain import read_detections_3d
 from lcf3d.formats.tables import read_table_2d, read_table_3d, table_classes
+from lcf3d.frame import Frame
 from lcf3d.geometry.boxes import transform_boxes
-from lcf3d.structures import Camera, Detections2D, Detections3D, FloatArray, Frame
+from lcf3d.structures import Camera, Detections2D, Detections3D, FloatArray
 
 KITTI, PLAIN, TABLE, COCO, CAMERAS = "KITTI text", "JSON of our own", "parquet", "COCO JSON", "KITTI text by camera"
 

@@ -8,8 +8,9 @@ import numpy as np
 
 from lcf3d.datasets.folder_results import FolderLabels
 from lcf3d.datasets.folder_sensors import Sensors
+from lcf3d.frame import Frame
 from lcf3d.geometry.rotation import invert_rigid
-from lcf3d.structures import Camera, FloatArray, Frame
+from lcf3d.structures import Camera, FloatArray
 
 
 class FolderContent(Protocol):

@@ -20,8 +20,9 @@ from lcf3d.errors import ConfigError, DatasetError, FormatError, Lcf3dError
 from lcf3d.files import list_files, read_json, reading
 from lcf3d.formats.objects3d import from_mmdet3d, from_openpcdet
 from lcf3d.formats.pickles import read_arrays
+from lcf3d.frame import Frame
 from lcf3d.geometry.boxes import transform_boxes
-from lcf3d.structures import Detections3D, FloatArray, Frame
+from lcf3d.structures import Detections3D, FloatArray
 
 _NAMES = ("sample_idx", "frame_id", "token", "sample_token")
 

@@ -34,7 +34,8 @@ from lcf3d.files import list_files
 from lcf3d.formats.kitti import detections_3d, read_frame_ids, read_objects
 from lcf3d.formats.kitti_drives import read_camera_poses
 from lcf3d.formats.scans import read_scan, unit_intensity
-from lcf3d.structures import KITTI_CLASSES, Detections3D, FloatArray, Frame
+from lcf3d.frame import Frame
+from lcf3d.structures import KITTI_CLASSES, Detections3D, FloatArray
 
 PARTS = ("training", "testing")
 SCANS = (".bin", ".npy")

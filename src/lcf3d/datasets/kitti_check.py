@@ -14,10 +14,10 @@ from lcf3d.datasets.images import read_image
 from lcf3d.detectors.joins import join_classes
 from lcf3d.errors import Lcf3dError
 from lcf3d.formats.kitti import KittiObjects, read_objects
+from lcf3d.frame import Frame
 from lcf3d.geometry.boxes import points_in_boxes
 from lcf3d.geometry.camera import project_boxes
 from lcf3d.geometry.iou import image_iou
-from lcf3d.structures import Frame
 
 RULES = {
     "KIT01": "every frame of the split has a readable calibration",

@@ -16,7 +16,8 @@ from lcf3d.datasets.kitti_drives import Drive, odometry_drives, raw_drives, trac
 from lcf3d.errors import ConfigError, DatasetError
 from lcf3d.files import list_files
 from lcf3d.formats.kitti import read_frame_ids
-from lcf3d.structures import KITTI_CLASSES, Frame
+from lcf3d.frame import Frame
+from lcf3d.structures import KITTI_CLASSES
 
 
 class KittiSequences(KittiLikeDataset):

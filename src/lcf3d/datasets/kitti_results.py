@@ -25,10 +25,11 @@ from lcf3d.formats.kitti import (
     write_objects,
 )
 from lcf3d.formats.kitti_tracking import write_tracks
+from lcf3d.frame import Frame
 from lcf3d.geometry.boxes import lidar_from_kitti
 from lcf3d.geometry.camera import project_boxes
 from lcf3d.provenance import FusedDetections
-from lcf3d.structures import BoolArray, Detections2D, Detections3D, FloatArray, Frame, IntArray
+from lcf3d.structures import BoolArray, Detections2D, Detections3D, FloatArray, IntArray
 
 
 class _Table(NamedTuple):

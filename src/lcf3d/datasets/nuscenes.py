@@ -36,8 +36,9 @@ from lcf3d.formats.nuscenes_boxes import (
 )
 from lcf3d.formats.nuscenes_tracking import write_tracking
 from lcf3d.formats.scans import read_scan
+from lcf3d.frame import Frame, Sweep
 from lcf3d.geometry.rotation import invert_rigid, rigid_transforms
-from lcf3d.structures import NUSCENES_CLASSES, Camera, Detections3D, FloatArray, Frame, IntArray, Sweep
+from lcf3d.structures import NUSCENES_CLASSES, Camera, Detections3D, FloatArray, IntArray
 
 RAW_FROM_CANONICAL: FloatArray = np.array([[0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]], dtype=np.float64)
 """(4, 4) raw LIDAR_TOP coordinates from canonical ones."""

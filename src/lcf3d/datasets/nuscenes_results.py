@@ -11,8 +11,9 @@ import numpy as np
 from lcf3d.detectors.joins import LeftOut, join_cameras, join_classes, require_pixels
 from lcf3d.errors import FormatError
 from lcf3d.formats.coco import read_camera_detections
+from lcf3d.frame import Frame
 from lcf3d.provenance import FusedDetections
-from lcf3d.structures import Detections2D, Detections3D, Frame, IntArray
+from lcf3d.structures import Detections2D, Detections3D, IntArray
 
 
 class NuscenesLidarResults:

@@ -12,8 +12,9 @@ from lcf3d.detectors.joins import LeftOut, join_cameras, join_classes, require_p
 from lcf3d.errors import DatasetError
 from lcf3d.files import inside, list_files
 from lcf3d.formats.plain import read_detections_2d, read_detections_3d, write_detections_3d
+from lcf3d.frame import Frame
 from lcf3d.provenance import FusedDetections
-from lcf3d.structures import Detections2D, Detections3D, Frame
+from lcf3d.structures import Detections2D, Detections3D
 
 MOST_KEPT = 10_000
 """Frames whose detections stay in memory from the count of what fits to their use; others are read again."""

@@ -17,13 +17,14 @@ from lcf3d.detectors.base import CameraDetector, LidarDetector
 from lcf3d.detectors.named import load_detector
 from lcf3d.evaluation.ablation import suppressed
 from lcf3d.evaluation.generalization import GeneralizationMetrics, evaluate_generalization
+from lcf3d.frame import Frame
 from lcf3d.fusion.config import FusionConfig
 from lcf3d.fusion.pipeline import LateCascadeFusion
 from lcf3d.geometry.boxes import points_in_boxes
 from lcf3d.geometry.camera import project_boxes
 from lcf3d.localizers.named import ShippedLocalizer
 from lcf3d.provenance import FusedDetections
-from lcf3d.structures import KITTI_CLASSES, Detections2D, Detections3D, Frame
+from lcf3d.structures import KITTI_CLASSES, Detections2D, Detections3D
 
 FRAMES = 20
 CLASS_OF = {"Car": "Car", "Van": "Car", "Pedestrian": "Pedestrian", "Cyclist": "Cyclist"}

@@ -12,7 +12,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from lcf3d.structures import Detections2D, Detections3D, Frame
+from lcf3d.frame import Frame
+from lcf3d.structures import Detections2D, Detections3D
 
 Image = NDArray[np.uint8]
 

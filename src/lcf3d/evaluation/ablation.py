@@ -11,13 +11,14 @@ import numpy as np
 from lcf3d.errors import ConfigError
 from lcf3d.evaluation.bootstrap import Interval
 from lcf3d.evaluation.protocol import Evaluation
+from lcf3d.frame import Frame
 from lcf3d.fusion.calibration import Calibration
 from lcf3d.fusion.clustering import cluster_boxes
 from lcf3d.fusion.config import FusionConfig
 from lcf3d.fusion.localizer import Localizer
 from lcf3d.fusion.pipeline import LateCascadeFusion
-from lcf3d.provenance import Outcome
-from lcf3d.structures import Detections2D, Detections3D, Frame
+from lcf3d.reasons import Outcome
+from lcf3d.structures import Detections2D, Detections3D
 
 Progress = Callable[[Sequence[int]], Iterable[int]]
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from lcf3d.errors import DatasetError
 from lcf3d.evaluation.protocol import Evaluation, Verdict, open_evaluation, usual_frames
+from lcf3d.frame import Frame
 from lcf3d.fusion.calibration import Calibration, ScoreMap, ground_height
 from lcf3d.fusion.calibration_fit import block_folds, choose_map, fit_evidence, fit_map, log_loss
 from lcf3d.fusion.cluster_evidence import ClusterEvidence
@@ -18,7 +19,7 @@ from lcf3d.fusion.config import FusionConfig
 from lcf3d.fusion.evidence import Evidence, to_probability
 from lcf3d.fusion.pipeline import LateCascadeFusion
 from lcf3d.run.setup import RunRequest, read_inputs
-from lcf3d.structures import BoolArray, Detections2D, Detections3D, FloatArray, Frame, IntArray
+from lcf3d.structures import BoolArray, Detections2D, Detections3D, FloatArray, IntArray
 
 # a class with fewer judged detections than this, or fewer right or wrong ones than a quarter of it, gets no map
 FEWEST = 20

@@ -37,9 +37,10 @@ from lcf3d.evaluation.generalization import (
 from lcf3d.evaluation.kitti_outcomes import read_provenance
 from lcf3d.evaluation.protocol import ComparisonRow, EvaluationOptions, TableData, Verdict, refuse_options
 from lcf3d.evaluation.study import Study
+from lcf3d.frame import Frame
 from lcf3d.geometry.camera import project_boxes
 from lcf3d.geometry.iou import image_iou
-from lcf3d.structures import Camera, Detections2D, Detections3D, Frame
+from lcf3d.structures import Camera, Detections2D, Detections3D
 
 RIGHT_M = 2.0
 RIGHT_IOU = 0.5

@@ -13,7 +13,8 @@ from lcf3d.evaluation.center_distance import EvaluationBoxes, class_curves, matc
 from lcf3d.evaluation.reliability import reliability
 from lcf3d.evaluation.study import DISTANCE_RANGES, ClassStudy, DistanceRow, FusionOutcomes, ShownBox, Study
 from lcf3d.geometry.camera import project_boxes
-from lcf3d.provenance import FusedDetections, Reason
+from lcf3d.provenance import FusedDetections
+from lcf3d.reasons import Reason
 from lcf3d.structures import BoolArray, Camera, Detections3D, FloatArray, IntArray
 
 MATCH_M = 2.0

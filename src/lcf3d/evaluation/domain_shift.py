@@ -21,9 +21,10 @@ from lcf3d.evaluation.generalization import (
     evaluate_generalization,
     in_camera_view,
 )
+from lcf3d.frame import Frame
 from lcf3d.geometry.camera import project_points
 from lcf3d.geometry.iou import iou_3d
-from lcf3d.structures import KITTI_CLASSES, Camera, Detections2D, Detections3D, FloatArray, Frame
+from lcf3d.structures import KITTI_CLASSES, Camera, Detections2D, Detections3D, FloatArray
 
 IOU_THRESHOLDS: FloatArray = np.round(np.arange(0.1, 0.901, 0.05), 2)
 """IoU thresholds at which `ap_over_iou` is usually drawn."""

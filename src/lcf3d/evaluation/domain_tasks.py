@@ -21,11 +21,12 @@ from lcf3d.evaluation.domain_shift import (
     in_kitti_classes,
     split_truth,
 )
+from lcf3d.frame import Frame
 from lcf3d.fusion.config import FusionConfig
 from lcf3d.fusion.pipeline import LateCascadeFusion
 from lcf3d.run.setup import find_calibration
 from lcf3d.run.sources import DetectorOnFrames, LidarOnScans, open_cameras, open_lidar
-from lcf3d.structures import KITTI_CLASSES, NUSCENES_CLASSES, Camera, Detections2D, Detections3D, Frame
+from lcf3d.structures import KITTI_CLASSES, NUSCENES_CLASSES, Camera, Detections2D, Detections3D
 
 FRONT = {"kitti": "left", "nuscenes": "CAM_FRONT"}
 """Front camera by kind of dataset."""

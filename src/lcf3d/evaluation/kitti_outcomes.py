@@ -15,7 +15,8 @@ from lcf3d.evaluation.kitti_matching import COUNTS, FALSE_POSITIVE, TRUE_POSITIV
 from lcf3d.evaluation.study import FusionOutcomes
 from lcf3d.formats.kitti import KittiFrames, KittiObjects
 from lcf3d.geometry.boxes import kitti_from_lidar
-from lcf3d.provenance import FusedDetections, Reason
+from lcf3d.provenance import FusedDetections
+from lcf3d.reasons import Reason
 from lcf3d.run.table_folder import open_run_folder
 from lcf3d.structures import FloatArray, IntArray
 

@@ -39,8 +39,9 @@ from lcf3d.formats.kitti import (
     objects_from_detections_2d,
     read_folder,
 )
+from lcf3d.frame import Frame
 from lcf3d.geometry.camera import project_boxes
-from lcf3d.structures import Detections2D, Detections3D, FloatArray, Frame
+from lcf3d.structures import Detections2D, Detections3D, FloatArray
 
 Measure = Literal["3d", "bbox"]
 

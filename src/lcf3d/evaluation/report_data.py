@@ -13,9 +13,10 @@ from lcf3d.errors import DatasetError
 from lcf3d.evaluation.pictures import embedded_image, embedded_scan
 from lcf3d.evaluation.reliability import calibration_error
 from lcf3d.evaluation.study import ClassStudy, ShownBox, Study
+from lcf3d.frame import Frame
 from lcf3d.geometry.camera import project_boxes
 from lcf3d.provenance import FusedDetections
-from lcf3d.structures import Camera, FloatArray, Frame
+from lcf3d.structures import Camera, FloatArray
 
 OUTCOMES = ("right", "wrong", "missed", "found", "ignored", "dropped")
 """Of boxes; ``dropped`` are LiDAR detections that the fusion left out."""

@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from lcf3d.provenance import OUTCOMES, REAL, REASONS, WHOLE, Decisions, FusedDetections
+from lcf3d.provenance import REAL, WHOLE, Decisions, FusedDetections
+from lcf3d.reasons import OUTCOMES, REASONS
 from lcf3d.structures import Detections2D, Detections3D, FloatArray, IntArray
 
 Frames = Sequence[tuple[str, FusedDetections]]

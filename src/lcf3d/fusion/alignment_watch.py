@@ -10,9 +10,10 @@ from typing import Any, Literal
 import numpy as np
 
 from lcf3d.errors import ConfigError
+from lcf3d.frame import Frame
 from lcf3d.fusion.alignment import SHRINKAGE, TIME, Alignment, BoxPairs, fit_alignment, realigned
 from lcf3d.fusion.alignment_matching import Matcher, Sighting, match_sighting, vote_rotation
-from lcf3d.structures import Camera, Detections2D, Detections3D, FloatArray, Frame
+from lcf3d.structures import Camera, Detections2D, Detections3D, FloatArray
 
 Status = Literal["unknown", "ok", "drifting", "wrong"]
 

@@ -18,10 +18,11 @@ import numpy as np
 
 from lcf3d.errors import FormatError
 from lcf3d.files import read_json, write_json
+from lcf3d.frame import Frame
 from lcf3d.fusion.calibration import Transform, transform_scores
 from lcf3d.geometry.camera import project_boxes
 from lcf3d.geometry.iou import image_iou
-from lcf3d.structures import Detections2D, Detections3D, FloatArray, Frame, IntArray
+from lcf3d.structures import Detections2D, Detections3D, FloatArray, IntArray
 
 WIDTHS = (4, 18, 36, 36, 1)
 """Channels before, between and after the convolutions."""

@@ -14,7 +14,8 @@ from lcf3d.fusion.matching import Matches, View
 from lcf3d.fusion.recovery import Recovery
 from lcf3d.fusion.semantic import Ensemble, fuse_scores, semantic_fusion
 from lcf3d.geometry.iou import bev_iou
-from lcf3d.provenance import FusedDetections, Outcome, Reason
+from lcf3d.provenance import FusedDetections
+from lcf3d.reasons import Outcome, Reason
 from lcf3d.structures import BoolArray, Detections2D, Detections3D, FloatArray, IntArray, with_columns
 
 

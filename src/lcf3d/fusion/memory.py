@@ -19,13 +19,14 @@ from dataclasses import replace
 import numpy as np
 
 from lcf3d.errors import ConfigError
+from lcf3d.frame import Frame
 from lcf3d.fusion.memory_config import MemoryConfig
 from lcf3d.fusion.memory_ego import estimate_pose
 from lcf3d.fusion.memory_state import Memory, Moment, Tracks
 from lcf3d.fusion.memory_step import aged, step
 from lcf3d.geometry.rotation import invert_rigid
 from lcf3d.provenance import FusedDetections
-from lcf3d.structures import FloatArray, Frame
+from lcf3d.structures import FloatArray
 
 # a sensor that seems to move faster than this between frames has jumped, m/s and rad/s
 MAX_EGO_SPEED = 70.0

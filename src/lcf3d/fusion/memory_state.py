@@ -7,9 +7,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from lcf3d.frame import Frame
 from lcf3d.fusion.memory_config import ClassColumns, MemoryConfig
 from lcf3d.geometry.boxes import HEIGHT, LENGTH, YAW, Z
-from lcf3d.structures import Camera, FloatArray, Frame, IntArray
+from lcf3d.structures import Camera, FloatArray, IntArray
 
 # columns of `Tracks.numbers` and `Tracks.values`
 ID, LABEL, HITS = range(3)

@@ -10,6 +10,7 @@ from functools import cached_property, partial
 import numpy as np
 
 from lcf3d import plugins
+from lcf3d.frame import Frame
 from lcf3d.fusion.branches import Branches, by_camera_name, prepare_branches
 from lcf3d.fusion.calibration import Calibration
 from lcf3d.fusion.cluster_evidence import ClusterEvidence, evidence_of, fused_scores, gather_evidence, recovered_trust
@@ -27,8 +28,9 @@ from lcf3d.fusion.matching import Matches, View, boxes_after, confirmed_elsewher
 from lcf3d.fusion.recovery import NOTHING, Recovery, recover
 from lcf3d.fusion.roles import unknown_classes
 from lcf3d.fusion.warm_up import warm_up_frame
-from lcf3d.provenance import FusedDetections, Outcome, Reason
-from lcf3d.structures import BoolArray, Detections2D, Detections3D, FloatArray, Frame, IntArray
+from lcf3d.provenance import FusedDetections
+from lcf3d.reasons import Outcome, Reason
+from lcf3d.structures import BoolArray, Detections2D, Detections3D, FloatArray, IntArray
 
 log = logging.getLogger(__name__)
 

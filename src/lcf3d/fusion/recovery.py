@@ -13,7 +13,7 @@ from lcf3d.fusion.frustum import FrustumProposals, MaskMode, extract_frustums
 from lcf3d.fusion.localizer import Localizer
 from lcf3d.geometry.camera import project_boxes
 from lcf3d.geometry.iou import bev_iou, image_iou
-from lcf3d.provenance import Reason
+from lcf3d.reasons import Reason
 from lcf3d.structures import Camera, Detections2D, FloatArray, IntArray
 
 

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lcf3d.frame import Frame
 from lcf3d.fusion.branches import by_camera_name
 from lcf3d.fusion.calibration import (
     Calibration,
@@ -26,7 +27,7 @@ from lcf3d.fusion.evidence import Evidence
 from lcf3d.fusion.matching import assign
 from lcf3d.geometry.camera import project_boxes
 from lcf3d.geometry.iou import image_iou
-from lcf3d.structures import BoolArray, Detections2D, Detections3D, FloatArray, Frame, IntArray
+from lcf3d.structures import BoolArray, Detections2D, Detections3D, FloatArray, IntArray
 
 # 2D detections above this score teach
 TEACHER_SCORE = 0.5

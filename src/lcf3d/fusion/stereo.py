@@ -11,6 +11,7 @@ from pydantic import Field, model_validator
 from typing_extensions import Self
 
 from lcf3d.errors import ConfigError
+from lcf3d.frame import Frame
 from lcf3d.fusion.branches import Branches
 from lcf3d.fusion.clustering import Clusters
 from lcf3d.fusion.config import FusionConfig
@@ -20,8 +21,9 @@ from lcf3d.fusion.matching import Matches, View
 from lcf3d.fusion.pipeline import LateCascadeFusion
 from lcf3d.fusion.semantic import fuse_scores
 from lcf3d.fusion.stereo_pairing import check_not_exchanged, check_stereo_pair, pair_views
-from lcf3d.provenance import FusedDetections, Reason
-from lcf3d.structures import Detections2D, Detections3D, Frame, IntArray
+from lcf3d.provenance import FusedDetections
+from lcf3d.reasons import Reason
+from lcf3d.structures import Detections2D, Detections3D, IntArray
 
 
 class StereoConfig(FusionConfig):

@@ -6,8 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from lcf3d.frame import Frame
 from lcf3d.geometry.camera import project_boxes
-from lcf3d.structures import Camera, Detections2D, Detections3D, Frame
+from lcf3d.structures import Camera, Detections2D, Detections3D
 
 
 def warm_up_frame(class_names: Sequence[str]) -> tuple[Frame, Detections3D, dict[str, Detections2D]]:

@@ -12,6 +12,7 @@ import numpy as np
 
 from lcf3d.detectors.base import CameraDetector, LidarDetector
 from lcf3d.errors import ConfigError
+from lcf3d.frame import Frame
 from lcf3d.fusion.alignment_watch import AlignmentWatch
 from lcf3d.fusion.memory import remember
 from lcf3d.fusion.memory_config import MemoryConfig
@@ -37,7 +38,7 @@ from lcf3d.live.warming import warm_up
 from lcf3d.live.watching import WatchFeed
 from lcf3d.live.workers import Worker, attempt
 from lcf3d.provenance import FusedDetections
-from lcf3d.structures import Camera, Detections2D, Detections3D, Frame
+from lcf3d.structures import Camera, Detections2D, Detections3D
 
 
 class Fuser:

@@ -10,13 +10,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lcf3d.frame import Frame
 from lcf3d.fusion.alignment_watch import CameraReport
 from lcf3d.geometry.camera import project_boxes
 from lcf3d.geometry.iou import image_iou
 from lcf3d.live.messages import CameraBoxes, Image, Message
 from lcf3d.live.synchronizer import Synchronizer
 from lcf3d.provenance import FusedDetections
-from lcf3d.structures import Detections2D, Frame
+from lcf3d.structures import Detections2D
 
 OK, WARN, ERROR, STALE = range(4)
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from lcf3d.datasets.base import CameraSource, Dataset, LidarSource
+from lcf3d.frame import Frame
 from lcf3d.fusion.alignment_watch import WatchSettings
 from lcf3d.fusion.memory_config import MemoryConfig
 from lcf3d.fusion.pipeline import LateCascadeFusion
@@ -18,7 +19,7 @@ from lcf3d.live.messages import CameraBoxes, CameraModel, EgoPose, Image, LidarB
 from lcf3d.live.settings import LiveResult, LiveSettings
 from lcf3d.live.synchronizer import SyncSettings
 from lcf3d.run.sources import CameraOnImages, LidarOnScans
-from lcf3d.structures import Camera, Frame
+from lcf3d.structures import Camera
 
 # between drives, and between frames further apart than this, the replay waits this long (seconds); longer than a memory
 PAUSE = 1.2

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from lcf3d.frame import Frame
 from lcf3d.fusion.alignment_watch import WatchSettings
 from lcf3d.live.synchronizer import SyncSettings
 from lcf3d.provenance import FusedDetections
-from lcf3d.structures import Frame
 
 
 @dataclass(frozen=True)

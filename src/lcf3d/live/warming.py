@@ -7,12 +7,13 @@ from typing import Any
 
 import numpy as np
 
+from lcf3d.frame import Frame
 from lcf3d.fusion.alignment import Alignment
 from lcf3d.fusion.alignment_matching import Sighting
 from lcf3d.fusion.alignment_watch import estimate
 from lcf3d.fusion.pipeline import LateCascadeFusion
 from lcf3d.geometry.camera import project_boxes
-from lcf3d.structures import Camera, Detections2D, Detections3D, Frame
+from lcf3d.structures import Camera, Detections2D, Detections3D
 
 
 def warm_up(fusion: LateCascadeFusion, cameras: Sequence[Camera], detectors: Mapping[str, Any]) -> None:

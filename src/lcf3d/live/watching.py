@@ -8,11 +8,12 @@ from typing import Any
 
 import numpy as np
 
+from lcf3d.frame import Frame
 from lcf3d.fusion.alignment_watch import AlignmentWatch
 from lcf3d.live.health import Health
 from lcf3d.live.poses import PoseBuffer, relative_velocities
 from lcf3d.live.workers import Worker
-from lcf3d.structures import Detections2D, Detections3D, FloatArray, Frame
+from lcf3d.structures import Detections2D, Detections3D, FloatArray
 
 # no moment waits longer than this (seconds)
 LONGEST_OFFSET = 0.5

@@ -13,9 +13,10 @@ import numpy as np
 
 from lcf3d.errors import FormatError, Lcf3dError
 from lcf3d.files import atomic_path, reading, shortened
+from lcf3d.frame import Frame
 from lcf3d.run.frames import FrameRunner
 from lcf3d.run.sources import CameraOnImages, LidarOnScans
-from lcf3d.structures import Detections2D, Detections3D, Frame, InstanceMask
+from lcf3d.structures import Detections2D, Detections3D, InstanceMask
 
 Found = TypeVar("Found", Detections2D, Detections3D)
 

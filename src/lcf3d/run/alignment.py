@@ -9,11 +9,11 @@ import numpy as np
 from lcf3d.datasets.base import CameraSource, Dataset, LidarSource
 from lcf3d.datasets.check import Finding
 from lcf3d.errors import DatasetError
+from lcf3d.frame import Frame
 from lcf3d.fusion.alignment import Alignment, realigned
 from lcf3d.fusion.alignment_matching import Sighting
 from lcf3d.fusion.alignment_watch import CORRELATED, FEWEST_PAIRS, CameraReport, WatchSettings, estimate, judge
 from lcf3d.run.sources import CameraOnImages
-from lcf3d.structures import Frame
 
 # frames that are looked at, evenly over the drive; the same where a camera detector has to be run on them
 FRAMES, FRAMES_WITH_IMAGES = 200, 40

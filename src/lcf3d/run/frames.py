@@ -13,19 +13,21 @@ from typing import Any, Protocol
 
 from lcf3d.datasets.base import CameraSource, Dataset, LidarSource
 from lcf3d.errors import ConfigError, DatasetError
+from lcf3d.frame import Frame
 from lcf3d.fusion.alignment import Alignment
 from lcf3d.fusion.memory import remember
 from lcf3d.fusion.memory_config import MemoryConfig
 from lcf3d.fusion.memory_smooth import smooth_sequence
 from lcf3d.fusion.memory_state import Memory
 from lcf3d.processes import end_with_parent, workers
-from lcf3d.provenance import OUTCOMES, REASONS, FusedDetections
+from lcf3d.provenance import FusedDetections
+from lcf3d.reasons import OUTCOMES, REASONS
 from lcf3d.remote.places import is_watching, watch
 from lcf3d.run.alignment import aligned_frame
 from lcf3d.run.folder import RunFolder
 from lcf3d.run.sources import DetectorOnFrames, LidarOnScans
 from lcf3d.run.table_folder import SHARD_FRAMES, TableRunFolder
-from lcf3d.structures import Detections2D, Detections3D, Frame
+from lcf3d.structures import Detections2D, Detections3D
 
 
 class Fusion(Protocol):

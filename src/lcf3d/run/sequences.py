@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Sequence
 
 from lcf3d.datasets.base import Dataset
 from lcf3d.errors import DatasetError
-from lcf3d.structures import Frame
+from lcf3d.frame import Frame
 
 
 def in_order(dataset: Dataset, frame_ids: Sequence[str]) -> list[list[str]]:

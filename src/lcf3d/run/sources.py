@@ -12,7 +12,8 @@ from lcf3d.datasets.base import CameraSource, Dataset, LidarSource
 from lcf3d.detectors.base import CameraDetector, FrameDetector, LidarDetector, cloud_request
 from lcf3d.detectors.lidar.sweeps import cloud_of, missing_of
 from lcf3d.detectors.named import load_detector
-from lcf3d.structures import Detections2D, Detections3D, Frame
+from lcf3d.frame import Frame
+from lcf3d.structures import Detections2D, Detections3D
 
 log = logging.getLogger(__name__)
 

@@ -17,9 +17,9 @@ from pathlib import Path
 
 from lcf3d.errors import ConfigError, FormatError
 from lcf3d.formats.fused_table import arrow, read_frame_ids, read_frames, write_detections, write_frames
+from lcf3d.frame import Frame
 from lcf3d.provenance import FusedDetections
 from lcf3d.run.folder import RunFolder, is_behind_link
-from lcf3d.structures import Frame
 
 FORMS = ("folder", "parquet")
 """Forms of run folders: files of each frame, or tables of many."""

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from lcf3d.errors import ConfigError
 from lcf3d.formats.kitti import KittiObjects, detections_3d
+from lcf3d.frame import Frame
 from lcf3d.geometry.boxes import points_in_boxes, transform_boxes
 from lcf3d.geometry.rotation import invert_rigid
 from lcf3d.simulation.actors import KITTI_CLASS, NUSCENES_CLASS, Actor
@@ -31,7 +32,6 @@ from lcf3d.structures import (
     Detections2D,
     Detections3D,
     FloatArray,
-    Frame,
     InstanceMask,
     IntArray,
 )

@@ -19,10 +19,11 @@ from lcf3d.detectors.fusion.painting import painted_points
 from lcf3d.detectors.lidar.config import LidarConfig
 from lcf3d.detectors.lidar.grounding import LEVEL_M, level_points
 from lcf3d.errors import ConfigError, DatasetError
+from lcf3d.frame import Frame
 from lcf3d.geometry.boxes import points_in_boxes
 from lcf3d.geometry.camera import project_points
 from lcf3d.geometry.ground import ground_field
-from lcf3d.structures import KITTI_CLASSES, Detections3D, FloatArray, Frame, IntArray
+from lcf3d.structures import KITTI_CLASSES, Detections3D, FloatArray, IntArray
 from lcf3d.training.samples import ScanSample, read_scan
 
 BACKGROUND, IGNORED = -1, -2

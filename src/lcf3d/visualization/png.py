@@ -13,7 +13,8 @@ import PIL.ImageOps
 from numpy.typing import NDArray
 
 from lcf3d.files import atomic_path
-from lcf3d.structures import Camera, Frame
+from lcf3d.frame import Frame
+from lcf3d.structures import Camera
 from lcf3d.visualization.bev import BevView, draw_bev
 from lcf3d.visualization.camera_view import draw_camera
 from lcf3d.visualization.canvas import Canvas, Colour, text_size

@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lcf3d.errors import MissingExtraError
+from lcf3d.frame import Frame
 from lcf3d.geometry.rotation import quaternions_from_yaws
 from lcf3d.provenance import FusedDetections
-from lcf3d.structures import Camera, Detections3D, FloatArray, Frame
+from lcf3d.structures import Camera, Detections3D, FloatArray
 from lcf3d.visualization.scene import CAMERA_COLOUR, COLOURS, TRUTH_COLOUR, Scene, drawn_dropped
 from lcf3d.visualization.trails import Trails
 

@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from lcf3d.provenance import FusedDetections, Outcome, Reason
+from lcf3d.provenance import FusedDetections
+from lcf3d.reasons import Outcome, Reason
 from lcf3d.structures import BoolArray, Detections2D, Detections3D, FloatArray, IntArray
 from lcf3d.visualization.canvas import Colour
 

@@ -6,9 +6,10 @@ from collections import deque
 
 import numpy as np
 
+from lcf3d.frame import Frame
 from lcf3d.geometry.rotation import invert_rigid, transform_points
 from lcf3d.provenance import FusedDetections
-from lcf3d.structures import FloatArray, Frame
+from lcf3d.structures import FloatArray
 
 SECONDS = 2.0
 

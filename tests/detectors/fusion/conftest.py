@@ -8,7 +8,7 @@ import pytest
 
 from lcf3d.datasets.kitti import KittiDataset
 from lcf3d.datasets.nuscenes import NuscenesDataset
-from lcf3d.structures import Frame
+from lcf3d.frame import Frame
 
 
 @pytest.fixture

@@ -11,7 +11,8 @@ from lcf3d.detectors.fusion import bevfusion, mvxnet, view_transform  # noqa: E4
 from lcf3d.detectors.fusion.images import image_of  # noqa: E402
 from lcf3d.distortion import Distortion  # noqa: E402
 from lcf3d.errors import ConfigError, DatasetError, DetectorError, ShapeError  # noqa: E402
-from lcf3d.structures import Camera, Frame  # noqa: E402
+from lcf3d.frame import Frame  # noqa: E402
+from lcf3d.structures import Camera  # noqa: E402
 
 # camera axes x right, y down, z forward from LiDAR axes x forward, y left, z up
 CAMERA_FROM_LIDAR = np.array([[0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]], np.float64)

@@ -14,7 +14,8 @@ from lcf3d.detectors.lidar.inputs import statistics_of
 from lcf3d.detectors.lidar.presets import COMPACT_KITTI, painted_config
 from lcf3d.detectors.lidar.statistics import FEATURES, painted_statistics, pillar_statistics
 from lcf3d.errors import ConfigError, DatasetError, DetectorError, ShapeError
-from lcf3d.structures import KITTI_CLASSES, Camera, Detections2D, Detections3D, Frame, InstanceMask
+from lcf3d.frame import Frame
+from lcf3d.structures import KITTI_CLASSES, Camera, Detections2D, Detections3D, InstanceMask
 
 # looks along x; a point (x, y, z) is seen at (32 - 40 y / x, 16 - 40 z / x)
 CAMERA = Camera(

@@ -21,8 +21,9 @@ from lcf3d.detectors.lidar.kinds import InClasses
 from lcf3d.detectors.lidar.presets import PRESETS
 from lcf3d.detectors.lidar.sweeps import accumulate_sweeps, cloud_of, in_view, missing_of
 from lcf3d.errors import ConfigError, DatasetError
+from lcf3d.frame import Frame, Sweep
 from lcf3d.run.sources import LidarOnScans
-from lcf3d.structures import Camera, Detections3D, Frame, Sweep
+from lcf3d.structures import Camera, Detections3D
 from tests.datasets.nuscenes_world import START_US, world_tables, write_world
 
 NUSCENES = [name for name in PRESETS if "nuscenes" in name]

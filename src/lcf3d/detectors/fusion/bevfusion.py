@@ -29,12 +29,13 @@ from lcf3d.detectors.lidar.sweeps import cloud_of
 from lcf3d.detectors.lidar.voxelization import in_area, select_channels, voxelize
 from lcf3d.detectors.lidar.voxels import voxel_backbone
 from lcf3d.errors import DatasetError, DetectorError
+from lcf3d.frame import Frame
 from lcf3d.geometry.boxes import canonical_from_mmdet3d
 from lcf3d.networks.checkpoints import read_state_dict
 from lcf3d.networks.convolution import ConvModule
 from lcf3d.networks.swin import SwinTransformer
 from lcf3d.networks.torch import Tensor, functional, nn, torch
-from lcf3d.structures import Camera, Detections3D, FloatArray, Frame
+from lcf3d.structures import Camera, Detections3D, FloatArray
 
 CLASSES = (
     "car",

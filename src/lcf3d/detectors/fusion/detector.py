@@ -15,8 +15,9 @@ from lcf3d.detectors.lidar.detector import channels_innermost
 from lcf3d.detectors.lidar.fusing import fuse_batch_norm
 from lcf3d.detectors.lidar.loading import load_published
 from lcf3d.errors import ConfigError, DatasetError
+from lcf3d.frame import Frame
 from lcf3d.networks.torch import nn, torch, torch_device
-from lcf3d.structures import Detections3D, Frame
+from lcf3d.structures import Detections3D
 
 Arrays = dict[str, NDArray[Any]]
 

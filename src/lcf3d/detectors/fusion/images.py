@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from lcf3d.detectors.base import Image
 from lcf3d.errors import DatasetError, ShapeError
+from lcf3d.frame import Frame
 from lcf3d.geometry.camera import require_pinhole
-from lcf3d.structures import Camera, Frame
+from lcf3d.structures import Camera
 
 
 def image_of(frame: Frame, camera: Camera) -> Image:

@@ -31,11 +31,12 @@ from lcf3d.detectors.lidar.sweeps import in_view
 from lcf3d.detectors.lidar.voxelization import decorate, voxelize
 from lcf3d.detectors.lidar.voxels import voxel_backbone
 from lcf3d.detectors.resizing import fitted_size, resize_bilinear
+from lcf3d.frame import Frame
 from lcf3d.networks.checkpoints import read_state_dict
 from lcf3d.networks.convolution import ConvModule, FeaturePyramid
 from lcf3d.networks.resnet import ResNet
 from lcf3d.networks.torch import Tensor, functional, nn, torch
-from lcf3d.structures import Camera, Detections3D, Frame
+from lcf3d.structures import Camera, Detections3D
 
 CONFIG = replace(
     SECOND_KITTI,

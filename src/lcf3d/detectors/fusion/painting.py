@@ -21,8 +21,9 @@ from lcf3d.detectors.fusion.painters import Painter, load_painter
 from lcf3d.detectors.lidar.onnx import OnnxLidarDetector
 from lcf3d.detectors.lidar.suppression import NmsMode
 from lcf3d.errors import ConfigError, DatasetError, DetectorError
+from lcf3d.frame import Frame
 from lcf3d.geometry.camera import project_points
-from lcf3d.structures import Camera, Detections3D, Frame
+from lcf3d.structures import Camera, Detections3D
 
 WithoutImage = Literal["error", "unpainted"]
 

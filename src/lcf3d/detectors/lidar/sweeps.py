@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 
 from lcf3d.detectors.base import CloudRequest
 from lcf3d.errors import DatasetError, ShapeError
+from lcf3d.frame import Frame, Sweep
 from lcf3d.geometry.camera import project_points
-from lcf3d.structures import Camera, Frame, Sweep
+from lcf3d.structures import Camera
 
 __all__ = ["Sweep", "accumulate_sweeps", "cloud_of", "in_view", "missing_of"]
 
