@@ -27,7 +27,8 @@ from tests.fusion.scenes import CAR, PEDESTRIAN, camera, surface_points
 from tests.localizers.scenes import propose
 
 FRAMES = ("000000", "000001", "000002", "000003", "000008")
-DRIVE = ("0000_000000", "0000_000001")
+# five drives, so that a cross-validation may leave whole ones out
+DRIVE = tuple(f"{drive:04d}_{i:06d}" for drive in range(5) for i in range(2))
 LIDAR = ("DIR_3D", "point_gnn", "pointpillars", "pointrcnn", "lidar_only", "pillars_k", "pillars_n_on_k")
 CAMERA = ("DIR_2D", "rcnn_2d", "rrc_2d", "faster_rcnn", "frustum_pointnets_2d", "yolo", "boxes_2d")
 FOLDERS = ("", "runs/", "results/")
@@ -60,7 +61,9 @@ def write_base(root: Path) -> None:
     make_kitti(root / "DRIVES", DRIVE)
     scans = make_tracking(root / "TRACKING", ("0000",)) / "training" / "velodyne" / "0000"
     shutil.copy(scans / "000000.bin", scans / "000001.bin")
-    shutil.copytree(root / "TRACKING/training/label_02", root / "DRIVES/training/label_02")
+    make_tracking(root / "TRACKING_5", tuple(f"{drive:04d}" for drive in range(5)))
+    shutil.move(root / "TRACKING_5/training/label_02", root / "DRIVES/training/label_02")
+    shutil.rmtree(root / "TRACKING_5")
     make_raw(root / "RAW")
     write_drive_with_objects(root / "drive.mcap")
     _other_tools(root)
