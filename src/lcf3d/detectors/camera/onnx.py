@@ -273,7 +273,7 @@ def _metadata_names(metadata: Mapping[str, str]) -> tuple[str, ...] | None:
     if isinstance(names, dict):
         try:
             names = [names[key] for key in sorted(names, key=int)]
-        except (ValueError, TypeError):
+        except (ValueError, TypeError, OverflowError):
             return None
     return tuple(str(name) for name in names) if names else None
 
