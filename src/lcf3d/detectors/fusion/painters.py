@@ -193,7 +193,7 @@ def onnx_painter(
     asked = _size(str(size))
     session = open_session(Path(argument), threads, "a segmentation network")
     inputs = session.get_inputs()
-    shape = inputs[0].shape if len(inputs) == 1 else ()
+    shape: Sequence[Any] = inputs[0].shape if len(inputs) == 1 else ()
     if len(shape) != 4 or shape[1] != 3:
         raise DetectorError(f"{argument} takes {[i.shape for i in inputs]}, expected one image of shape (1, 3, H, W)")
     fixed = [side for side in shape[2:] if isinstance(side, int)]
