@@ -73,3 +73,9 @@ def test_damaged_files(tmp_path, content):
         read_arrays(path)
     with pytest.raises(FormatError, match="does not exist"):
         read_arrays(tmp_path / "absent.pkl")
+
+
+def test_a_bomb_of_object_numbers_is_refused(tmp_path):
+    (tmp_path / "a.pkl").write_bytes(b"\x80\x02]r\xff\xff\xff\x7f.")
+    with pytest.raises(FormatError, match="object 2147483647 at byte"):
+        read_arrays(tmp_path / "a.pkl")

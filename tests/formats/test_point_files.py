@@ -74,6 +74,12 @@ def test_las(tmp_path, suffix):
     cloud.intensity = np.round(POINTS[:, 3] * 65535).astype(np.uint16)
     cloud.write(str(tmp_path / f"a{suffix}"))
     assert np.allclose(read_scan(tmp_path / f"a{suffix}"), POINTS, atol=1e-3)
+    # billions of records in the header: not one is made
+    bomb = bytearray((tmp_path / f"a{suffix}").read_bytes())
+    bomb[100:104] = b"\xff" * 4
+    (tmp_path / f"bomb{suffix}").write_bytes(bomb)
+    with pytest.raises(FormatError, match="counts more records than it holds"):
+        read_scan(tmp_path / f"bomb{suffix}")
     (tmp_path / f"b{suffix}").write_bytes(b"LASF")
     with pytest.raises(FormatError, match="cannot be read as a LAS file"):
         read_scan(tmp_path / f"b{suffix}")

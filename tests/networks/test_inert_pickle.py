@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import builtins
 import importlib
+import io
 import os
+import pickle
 import subprocess
 import sys
 from collections import OrderedDict
@@ -21,7 +23,7 @@ torch = pytest.importorskip("torch")
 
 from lcf3d.errors import DetectorError  # noqa: E402
 from lcf3d.networks.checkpoints import read_state_dict  # noqa: E402
-from lcf3d.networks.inert_pickle import Inert, LazyTensor, load_inert  # noqa: E402
+from lcf3d.networks.inert_pickle import Inert, LazyTensor, load_inert, require_memo  # noqa: E402
 
 
 @pytest.fixture
@@ -248,3 +250,16 @@ def test_reading_imports_none_of_the_modules_named(shared: Path):
         "assert not [m for m in sys.modules if m.startswith(('mmengine', 'mmcv'))]"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+@pytest.mark.parametrize("put", [b"r\xff\xff\xff\x7f", b"p2147483647\n"])
+def test_an_object_of_number_two_billion_makes_no_room_for_two_billion(put: bytes) -> None:
+    file = io.BytesIO(b"before" + b"\x80\x02]" + put + b".")
+    file.seek(6)
+    with pytest.raises(pickle.UnpicklingError, match="object 2147483647 at byte"):
+        require_memo(file)
+    assert file.tell() == 6
+    # what pickle writes itself passes, in every protocol, and so does what is none
+    for protocol in range(pickle.HIGHEST_PROTOCOL + 1):
+        require_memo(io.BytesIO(pickle.dumps([[i, str(i)] for i in range(70_000)], protocol)))
+    require_memo(io.BytesIO(b"no pickle"))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import pickle
+import re
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import numpy as np
 
 from lcf3d.errors import FormatError
 from lcf3d.files import read_bytes, shortened
+from lcf3d.networks.inert_pickle import require_memo
 
 # modules moved in numpy 2; what a pickled array or scalar names
 _NUMPY = {
@@ -63,6 +65,8 @@ def read_arrays(path: Path) -> Any:
         raise FormatError(f"{path} does not exist")
     raw = read_bytes(path)
     try:
+        if _large_numbers(raw):
+            require_memo(io.BytesIO(raw))
         return _ArraysOnly(io.BytesIO(raw)).load()
     except pickle.UnpicklingError as error:
         reason = str(error)
@@ -77,3 +81,11 @@ def read_arrays(path: Path) -> Any:
         raise FormatError(
             f"{path} is no pickle file, or a damaged one ({shortened(f'{type(error).__name__}: {error}')})"
         ) from None
+
+
+def _large_numbers(raw: bytes) -> bool:
+    """Whether anything in a pickle may be a number of an object beyond its length; arrays make it likely by chance."""
+    data = np.frombuffer(raw, dtype=np.uint8)
+    places = np.flatnonzero(data[:-4] == ord("r")) + 1
+    numbers = sum(data[places + i].astype(np.int64) << 8 * i for i in range(4))
+    return bool(np.any(numbers > len(raw))) or re.search(rb"p\d{6,}", raw) is not None

@@ -24,6 +24,8 @@ INTENSITY = ("intensity", "i", "reflectance", "reflectivity", "remission", "scal
 # no scanner sees farther: larger numbers, or tiny ones in most points, are another type or byte order
 _FARTHEST_M = 1e5
 _TINY_M = 1e-20
+# least bytes of a LAS file's variable length records, and of the extended ones of LAS 1.4
+_LAS_RECORD, _LAS_LONG_RECORD = 54, 60
 _PLY_TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
     "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
@@ -139,6 +141,7 @@ def _read_las(path: Path, raw: bytes, columns: Sequence[str]) -> dict[str, NDArr
         import laspy
     except ImportError:
         raise MissingExtraError("laspy", "formats", f"reading {path.suffix} scans") from None
+    _require_las_header(path, raw)
     try:
         cloud = laspy.read(str(path))
         fields = {name: np.asarray(getattr(cloud, name), dtype=np.float64) for name in "xyz"}
@@ -148,6 +151,19 @@ def _read_las(path: Path, raw: bytes, columns: Sequence[str]) -> dict[str, NDArr
     except Exception as error:
         raise FormatError(f"{path} cannot be read as a LAS file ({shortened(error)})") from None
     return fields
+
+
+def _require_las_header(path: Path, raw: bytes) -> None:
+    """See that the records a LAS header counts have room in the file; the library makes as many, however long it takes.
+
+    Raises:
+        FormatError: they do not.
+    """
+    counts = [(raw[100:104], _LAS_RECORD)]
+    if raw[24:26] == b"\x01\x04":
+        counts.append((raw[243:247], _LAS_LONG_RECORD))
+    if any(int.from_bytes(count, "little") * size > len(raw) for count, size in counts):
+        raise FormatError(f"{path} cannot be read as a LAS file (its header counts more records than it holds)")
 
 
 def _read_ply(path: Path, raw: bytes, columns: Sequence[str]) -> dict[str, NDArray[Any]]:

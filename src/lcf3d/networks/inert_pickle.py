@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 import pickle
+import pickletools
 import struct
 import zipfile
 from collections.abc import Callable
@@ -20,6 +21,8 @@ from typing import IO, Any
 
 LEGACY_MAGIC = 0x1950A86A20F9469CFC6C
 LEGACY_PROTOCOL = 1001
+LEAST_MEMO = 1 << 16
+"""Numbers of objects up to here cost nothing, wherever they stand."""
 EXPANDED = 1 << 24
 """A tensor that repeats its numbers may have this many, however few there are in the file."""
 _DTYPES = {
@@ -178,6 +181,31 @@ class _Unpickler(pickle.Unpickler):
         return Inert() if dtype is None else self._storage(dtype, pid[2:])
 
 
+def require_memo(file: IO[bytes]) -> None:
+    """See that a pickle numbers its objects as it goes; Python makes room for as many as the largest number says.
+
+    The file is left where it was. What is no pickle at all is left to the reading of it.
+
+    Raises:
+        pickle.UnpicklingError: a number that no pickle of that length reaches, worth gigabytes of room.
+    """
+    start = file.tell()
+    try:
+        for operation, argument, place in pickletools.genops(file):
+            # an object takes a byte or more, so that no number is larger than its place in the file
+            if operation.name in ("PUT", "BINPUT", "LONG_BINPUT") and int(argument or 0) > (place or 0) + LEAST_MEMO:
+                raise pickle.UnpicklingError(f"object {argument} at byte {place}")
+    except (ValueError, IndexError, OverflowError):
+        return
+    finally:
+        file.seek(start)
+
+
+def _load(file: IO[bytes], storage: Callable[[str, tuple[Any, ...]], Storage] | None = None) -> Any:
+    require_memo(file)
+    return _Unpickler(file, storage).load()
+
+
 def load_inert(path: Path) -> Any:
     """The content of a file of ``torch.save``: containers, plain values, `LazyTensor` and `Inert`.
 
@@ -202,7 +230,7 @@ def _load_zip(path: Path) -> Any:
         return Storage(dtype, lambda: archive.read(f"{root}data/{reference[0]}"))
 
     with archive.open(pickled[0]) as file:
-        return _Unpickler(file, storage).load()
+        return _load(file, storage)
 
 
 def _load_legacy(path: Path) -> Any:
@@ -229,13 +257,13 @@ def _load_legacy(path: Path) -> Any:
 
     sizes: dict[str, int] = {}
     with path.open("rb") as file:
-        if _Unpickler(file).load() != LEGACY_MAGIC or _Unpickler(file).load() != LEGACY_PROTOCOL:
+        if _load(file) != LEGACY_MAGIC or _load(file) != LEGACY_PROTOCOL:
             raise ValueError("no file of torch.save")
-        machine = _Unpickler(file).load()
+        machine = _load(file)
         if not machine.get("little_endian", True):
             raise ValueError("written on a big-endian machine")
-        content = _Unpickler(file, storage).load()
-        keys = _Unpickler(file).load()
+        content = _load(file, storage)
+        keys = _load(file)
         end = path.stat().st_size
         for key in keys:
             (count,) = struct.unpack("<q", file.read(8))
