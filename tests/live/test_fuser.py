@@ -248,7 +248,8 @@ def test_a_detector_that_raises_is_reported_and_the_rest_goes_on():
     messages = [m for i in range(4) for m in (LidarBoxes(0.1 * i, boxes3d(street(i))), Image(0.1 * i, "left", pixels))]
     results = run(target, messages)
     assert len(results) == 4
-    assert "failed 4 times, last RuntimeError: no memory" in entry(target, "camera left")["message"]
+    message = entry(target, "camera left")["message"]
+    assert "failed 4 times in the latest 30 s, last RuntimeError: no memory" in message
 
 
 def test_a_detector_that_hangs_costs_the_deadline_and_drops_what_waited():

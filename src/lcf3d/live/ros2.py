@@ -6,6 +6,7 @@ What it reads and writes is in `lcf3d.formats.ros_messages`. Its parameters are 
 from __future__ import annotations
 
 from importlib import import_module
+from time import monotonic
 from typing import Any
 
 import numpy as np
@@ -45,6 +46,8 @@ CAMERA_PARAMETERS: dict[str, tuple[Any, str]] = {
 }
 # stamps of messages kept, so that a result has its scan's to the nanosecond
 STAMPS = 256
+# seconds before the same warning is given again
+QUIET = 60.0
 
 
 class FuserNode:
@@ -86,7 +89,7 @@ class FuserNode:
         self.names = config.class_names
         self._stamps: dict[float, Any] = {}
         self._models: dict[str, bytes] = {}
-        self._told: set[str] = set()
+        self._told: dict[str, float] = {}
         self._connect()
 
     def _connect(self) -> None:
@@ -125,15 +128,17 @@ class FuserNode:
         return bool(self._values["messages"] == "autoware")
 
     def _guarded(self, callback: Any) -> Any:
-        """A callback whose errors are told once each and stop nothing."""
+        """A callback whose errors stop nothing and are told, each again after `QUIET` seconds at the soonest."""
 
         def guarded(*arguments: Any) -> None:
             try:
                 callback(*arguments)
             except Lcf3dError as error:
-                if str(error) not in self._told:
-                    self._told.add(str(error))
-                    self.node.get_logger().warning(str(error))
+                now, text = monotonic(), str(error)
+                self._told = {told: when for told, when in self._told.items() if now - when < QUIET}
+                if text not in self._told:
+                    self._told[text] = now
+                    self.node.get_logger().warning(text)
 
         return guarded
 
