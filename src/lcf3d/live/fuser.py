@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -31,17 +32,20 @@ from lcf3d.live.messages import (
     Message,
     Scan,
     is_whole,
+    plain_points,
     same_mount,
     source_of,
 )
 from lcf3d.live.poses import PoseBuffer
 from lcf3d.live.settings import LiveResult, LiveSettings
 from lcf3d.live.synchronizer import CameraPart, Group, Synchronizer
-from lcf3d.live.warming import warm_up
+from lcf3d.live.warming import made_up_cameras, rehearsal
 from lcf3d.live.watching import WatchFeed
 from lcf3d.live.workers import Worker, attempt
 from lcf3d.provenance import FusedDetections
 from lcf3d.structures import Camera, Detections2D, Detections3D
+
+log = logging.getLogger(__name__)
 
 
 class Fuser:
@@ -129,9 +133,36 @@ class Fuser:
         self._workers.clear()
 
     def warm_up(self) -> None:
-        """Load, compile and run everything once on made-up input: the first real frame is then as quick as others."""
+        """Load, compile and run everything on a made-up stream: the first real frame is then as quick as others.
+
+        A detector that fails on it is reported and stops nothing.
+        """
         with self._lock:
-            warm_up(self.fusion, [self._model(name, np.inf) for name in self._models], self._detectors)
+            known = [replace(self._model(name, np.inf), delay=0.0) for name in self._models]
+        cameras = known or made_up_cameras()
+        for detectors in ({}, self._detectors) if self._detectors else ({},):
+            twin = self._twin(cameras, detectors)
+            for message in rehearsal(cameras, self.fusion.config.class_names, detectors):
+                twin.push(message)
+            twin.flush()
+            twin.diagnostics()
+            for source, error in twin.health.last_error.items():
+                log.warning("%s failed on the made-up stream of the warm-up: %s", source, error)
+                self.health.tell(f"{source} failed at the warm-up: {error}")
+
+    def _twin(self, cameras: Sequence[Camera], detectors: Mapping[str, Any]) -> Fuser:
+        """A fuser with the same parts, to rehearse with: nothing in threads, and its watch looks at every moment."""
+        watch = self.settings.watch
+        settings = replace(
+            self.settings,
+            sync=replace(self.settings.sync, offsets={}),
+            realtime=False,
+            watch=None if watch is None else replace(watch, every=1, recent=2),
+            watch_period=0.0,
+        )
+        twin = Fuser(self.fusion, cameras, settings=settings, memory=self._memory_config or False)
+        twin._detectors = dict(detectors)
+        return twin
 
     def dropped(self) -> dict[str, int]:
         """Messages left out, by ``source: cause``."""
@@ -187,6 +218,7 @@ class Fuser:
             self._poses.add(message.time, message.world_from_lidar)
             return
         if isinstance(message, Scan):
+            message = replace(message, points=plain_points(message.points))
             self._sync.add_scan(message.time, message.points, arrival)
         if source in self._detectors and isinstance(message, Scan | Image):
             self._detect(source, message, arrival)
