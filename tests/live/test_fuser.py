@@ -350,3 +350,14 @@ def test_settings_that_cannot_work_are_refused():
         SyncSettings(tolerance=0.0)
     with pytest.raises(ConfigError, match="no camera"):
         fuser(offsets={"rear": 0.01})
+
+
+def test_the_watch_waits_while_a_message_is_taken_in():
+    target = fuser(realtime=True, watch=WatchSettings(every=1))
+    with target._lock:
+        for message in stream(3):
+            target.push(message)
+        assert not target._workers["watch"].wait_idle(0.2)
+    assert target._workers["watch"].wait_idle(20)
+    assert target.watch.report("left").frames >= 1
+    target.close()

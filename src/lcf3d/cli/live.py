@@ -49,6 +49,7 @@ def live(
 
     from lcf3d.live.outputs import Outputs
     from lcf3d.live.replay import in_order, make_fuser, replay
+    from lcf3d.live.warming import settle_memory
     from lcf3d.run.setup import RunRequest, calibrated_fusion, find_calibration, read_inputs
 
     request = RunRequest(
@@ -72,6 +73,8 @@ def live(
         fuser, rate > 0, pictures=pictures, rerun=rerun, health=health, cameras=inputs.dataset.used_cameras
     )
     fuser.warm_up()
+    outputs.warm_up()
+    settle_memory()
     report = replay(
         inputs.dataset, frame_ids, inputs.lidar, inputs.cameras, fuser, rate=rate, hertz=hertz,
         shown=pictures is not None or rerun is not None, on_results=outputs,

@@ -99,12 +99,12 @@ class Fuser:
         self.health = Health(fusion.config.class_names)
         self._sync = Synchronizer(self.settings.sync, Tally(self.health.clock))
         self._poses = PoseBuffer()
-        watch = self.settings.watch
-        self.watch = AlignmentWatch(fusion.config.class_names, watch) if watch is not None else None
+        self._lock = threading.RLock()
+        watch, names = self.settings.watch, fusion.config.class_names
+        self.watch = None if watch is None else AlignmentWatch(names, watch, self._let_pass)
         self._workers: dict[str, Worker] = {}
         self._detect_ms: dict[tuple[str, float], float] = {}
         self._results: list[LiveResult] = []
-        self._lock = threading.RLock()
         self._feed: WatchFeed | None = None
         if self.watch is not None:
             workers = self._workers if self.settings.realtime else None
@@ -196,6 +196,14 @@ class Fuser:
             self._advance(everything)
             results, self._results = self._results, []
             return results
+
+    def _let_pass(self) -> None:
+        """The watch in its thread waits while a message is being taken in: it must not hold up a result.
+
+        Python's own turns between threads are 5 ms long.
+        """
+        with self._lock:
+            pass
 
     def _take(self, message: Message, arrival: float) -> None:
         source = source_of(message)

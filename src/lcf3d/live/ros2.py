@@ -22,6 +22,7 @@ from lcf3d.live.fuser import Fuser
 from lcf3d.live.messages import CameraBoxes, CameraModel, EgoPose, LidarBoxes, Message, Scan
 from lcf3d.live.settings import LiveResult, LiveSettings
 from lcf3d.live.synchronizer import SyncSettings
+from lcf3d.live.warming import settle_memory
 from lcf3d.structures import Camera, FloatArray
 
 PARAMETERS: dict[str, tuple[Any, str]] = {
@@ -255,6 +256,7 @@ def spin(arguments: list[str] | None = None) -> None:
         listener = tf2_ros.TransformListener(buffer, node)
         shell = FuserNode(node, buffer)
         shell.fuser.warm_up()
+        settle_memory()
         rclpy.spin(node)
         del listener
     except KeyboardInterrupt:
