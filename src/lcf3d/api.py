@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -71,8 +72,12 @@ def run(
     pending = [frame_id for frame_id in prepared.frame_ids if not prepared.folder.is_done(frame_id)]
     counts = total(list(fuse_frames(prepared, pending, jobs, ray)))
     prepared.folder.finish(prepared.frame_ids)
+    warnings = prepared.warnings()
+    for sentence in warnings:
+        logging.getLogger(__name__).warning(sentence)
     return {
         **counts,
+        "warnings": list(warnings),
         "already_done": len(prepared.frame_ids) - len(pending),
         "out": str(out if is_url(out) else folder),
     }
