@@ -231,3 +231,17 @@ def test_the_parameter_file_names_parameters_that_there_are():
     for name, value in values.items():
         if name in PARAMETERS:
             assert isinstance(value, type(PARAMETERS[name][0]))
+
+
+@pytest.mark.parametrize("separator", [(), ("--",)])
+def test_the_command_hands_everything_on_to_ros(monkeypatch, separator):
+    from typer.testing import CliRunner
+
+    from lcf3d.cli.app import app
+
+    node = Node("lcf3d", parameters=parameters())
+    rclpy = install(monkeypatch, node)["rclpy"]
+    given = ["--ros-args", "--params-file", "fuser.yaml", "-r", "__ns:=/front"]
+    result = CliRunner().invoke(app, ["ros2", *separator, *given], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    assert rclpy.calls[0] == ("init", given)

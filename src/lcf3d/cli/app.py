@@ -66,7 +66,9 @@ def options(
 
 
 for verb, module in VERBS.items():
-    app.command(verb)(getattr(import_module(f"lcf3d.cli.{module}"), verb))
+    # what goes on to ROS is not ours to know
+    passing = {"ignore_unknown_options": True} if verb == "ros2" else {}
+    app.command(verb, context_settings=passing)(getattr(import_module(f"lcf3d.cli.{module}"), verb))
 for group, module in GROUPS.items():
     app.add_typer(getattr(import_module(f"lcf3d.cli.{module}"), group))
 
