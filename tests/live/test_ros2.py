@@ -97,7 +97,7 @@ def test_extrinsics_come_from_tf2_and_a_transform_that_is_late_is_waited_for(mon
     node.receive("left/camera_info", info())
     send(node, 1.0)
     assert len(node.publishers["fused/detections"].sent) == 1
-    assert np.allclose(target.fuser._models["left"][0][1].camera_from_lidar, matrix)
+    assert np.allclose(target.fuser._models.at("left", 0.0).camera_from_lidar, matrix)
 
 
 def test_boxes_of_another_frame_are_brought_into_the_lidars(monkeypatch):
