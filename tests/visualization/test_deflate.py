@@ -2,12 +2,13 @@ import zlib
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lcf3d.visualization.deflate import BLOCK, LONGEST, _code_lengths, compress
 
 
+@settings(deadline=None)
 @given(st.lists(st.tuples(st.integers(0, 255), st.integers(1, 700)), max_size=30), st.integers(0, 1000))
 def test_zlib_reads_back_what_was_written(runs, seed):
     noise = np.random.default_rng(seed).integers(0, 256, seed % 97, dtype=np.uint8)

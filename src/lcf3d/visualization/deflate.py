@@ -61,7 +61,7 @@ def compress(data: NDArray[np.uint8]) -> bytes:
     words, bits, held = (int(value) for value in place)
     out[words] = held
     whole = out[: words + 1].astype("<u4", copy=False).view(np.uint8)[: 4 * words + -(-bits // 8)]
-    return b"".join([b"\x78\x01", whole.data, zlib.adler32(data).to_bytes(4, "big")])
+    return b"".join([b"\x78\x01", whole.data, zlib.adler32(np.ascontiguousarray(data).data).to_bytes(4, "big")])
 
 
 def _header(length: NDArray[np.int64], last: bool) -> tuple[int, int]:
