@@ -20,7 +20,8 @@ def serve(
     from lcf3d.cli.console import console
     from lcf3d.cli.eval import report_origin
     from lcf3d.cli.export import dataset_of_run
-    from lcf3d.evaluation.protocol import EvaluationOptions, open_evaluation
+    from lcf3d.evaluation.opening import open_evaluation
+    from lcf3d.evaluation.protocol import EvaluationOptions
     from lcf3d.evaluation.server import HOST, report_app
     from lcf3d.evaluation.server import serve as serve_app
     from lcf3d.remote.places import local

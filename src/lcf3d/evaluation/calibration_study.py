@@ -10,7 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lcf3d.errors import DatasetError
-from lcf3d.evaluation.protocol import Evaluation, Verdict, open_evaluation, usual_frames
+from lcf3d.evaluation.opening import open_evaluation, usual_frames
+from lcf3d.evaluation.protocol import Evaluation, Verdict
 from lcf3d.frame import Frame
 from lcf3d.fusion.calibration import Calibration, ScoreMap, ground_height
 from lcf3d.fusion.calibration_fit import block_folds, choose_map, fit_evidence, fit_map, log_loss

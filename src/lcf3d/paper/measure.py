@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from lcf3d.datasets.opening import open_dataset
-from lcf3d.evaluation.protocol import EvaluationOptions, open_evaluation
+from lcf3d.evaluation.opening import open_evaluation
+from lcf3d.evaluation.protocol import EvaluationOptions
 from lcf3d.files import read_json, write_json
 from lcf3d.paper.kept import keep_detections
 from lcf3d.paper.networks import NeedsError, branches, substitutes
