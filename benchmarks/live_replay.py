@@ -28,6 +28,7 @@ from lcf3d.live.fuser import Fuser
 from lcf3d.live.messages import CameraBoxes, EgoPose, LidarBoxes, Message
 from lcf3d.live.settings import LiveResult, LiveSettings
 from lcf3d.live.synchronizer import SyncSettings
+from lcf3d.live.warming import settle_memory
 from lcf3d.simulation.presets import get_preset
 from lcf3d.structures import FloatArray
 
@@ -131,6 +132,7 @@ def run(hertz: float, seconds: float, realtime: bool, watch_period: float) -> di
         on_result=clock,
     )
     fuser.warm_up()
+    settle_memory()
     frames = round(hertz * seconds)
     results, behind, memory, since = 0, 0, [], []
     start, cpu = time.perf_counter(), time.process_time()
@@ -140,7 +142,7 @@ def run(hertz: float, seconds: float, realtime: bool, watch_period: float) -> di
             behind += left < -0.5 / hertz
             time.sleep(max(left, 0))
         for message in messages:
-            clock.pushed = time.thread_time()
+            clock.begin()
             for result in fuser.push(message):
                 results += 1
                 if realtime:
@@ -160,6 +162,7 @@ def run(hertz: float, seconds: float, realtime: bool, watch_period: float) -> di
         "dropped": fuser.dropped(),
         "added_ms": percentiles(clock.wall),
         "added_cpu_ms": percentiles(clock.cpu),
+        "added_waited_for_threads_ms": percentiles(clock.waited),
         "first_added_cpu_ms": round(clock.cpu[0], 2),
         "since_due_ms": percentiles(since) if since else None,
         "seconds": round(time.perf_counter() - start, 1),
@@ -170,16 +173,31 @@ def run(hertz: float, seconds: float, realtime: bool, watch_period: float) -> di
 
 
 class Clock:
-    """Latency of each result as it comes, before health and the watch: by the clock, and in CPU time of its thread."""
+    """Latency of each result as it comes, before health and the watch: by the clock, in CPU time of its thread, and how
+    long it waited for other threads of this process, which is neither CPU time nor waiting for a free core.
+    """
 
     def __init__(self) -> None:
-        self.pushed = 0.0
+        self._pushed = (0.0, 0.0, 0.0)
         self.cpu: list[float] = []
         self.wall: list[float] = []
+        self.waited: list[float] = []
+
+    @staticmethod
+    def _now() -> tuple[float, float, float]:
+        """Seconds by the clock, of CPU time, and of waiting for a core, of this thread."""
+        wanted = Path("/proc/thread-self/schedstat").read_text(encoding="ascii").split()[1]
+        return time.perf_counter(), time.thread_time(), int(wanted) * 1e-9
+
+    def begin(self) -> None:
+        """A message is pushed."""
+        self._pushed = self._now()
 
     def __call__(self, result: LiveResult) -> None:
         """A result has come."""
-        self.cpu.append((time.thread_time() - self.pushed) * 1e3)
+        wall, cpu, core = (1e3 * (now - then) for now, then in zip(self._now(), self._pushed, strict=True))
+        self.cpu.append(cpu)
+        self.waited.append(max(wall - cpu - core, 0.0))
         self.wall.append(result.latency_ms["added"])
 
 

@@ -9,7 +9,10 @@ from typer.testing import CliRunner
 from lcf3d import plugins
 from lcf3d.cli.app import app
 from lcf3d.errors import ConfigError
-from lcf3d.live.replay import frame_times
+from lcf3d.frame import Frame
+from lcf3d.fusion.calibration import Calibration
+from lcf3d.fusion.memory_config import ClassMemory
+from lcf3d.live.replay import frame_times, in_order
 from lcf3d.run.folder import RunFolder
 from tests.datasets.toy import write_toy
 
@@ -114,6 +117,35 @@ def test_a_bag_through_the_stream_gives_what_the_run_gives(bag, tmp_path, monkey
             np.testing.assert_array_equal(fused.tracks.hits, written.tracks.hits)
     if memory:
         assert came[-1].tracks.hits.max() == 6
+
+
+def test_a_memory_has_the_weights_of_the_calibration_in_files_and_in_the_stream(bag, tmp_path, monkeypatch):
+    fitted = Calibration(memory={name: ClassMemory(seen_weight=1.5, missed_weight=1.0) for name in ("car", "Car")})
+    fitted.dump(tmp_path / "calibration.json")
+    memory = ("--memory", "--calibration", tmp_path / "calibration.json")
+    came = results_of(monkeypatch, *bag, "--rate", "0", *memory)
+    plain = results_of(monkeypatch, *bag, "--rate", "0", "--memory", "--calibration", "none")
+    lcf3d("run", *bag, "--out", tmp_path / "fused", *memory)
+    folder = RunFolder(tmp_path / "fused")
+    assert len(came) == 6
+    for fused, frame_id in zip(came, folder.frame_ids(), strict=True):
+        written = folder.read(frame_id)
+        np.testing.assert_allclose(fused.detections.boxes, written.detections.boxes, atol=1e-5)
+        np.testing.assert_allclose(fused.detections.scores, written.detections.scores, atol=1e-6)
+    # the weights are really used
+    assert np.abs(came[-1].detections.scores - plain[-1].detections.scores).max() > 1e-3
+
+
+def test_a_memory_wants_each_drive_in_one_piece(toy):
+    from tests.datasets.toy import ToyDataset
+
+    class Two(ToyDataset):
+        def frame(self, frame_id):
+            number = int(frame_id[1:])
+            return Frame(frame_id, sequence=str(number % 2), timestamp=-0.1 * number)
+
+    assert in_order(Two(toy[0].partition(":")[2]), ("f00", "f01", "f02", "f03")) == ("f02", "f00", "f03", "f01")
+    assert in_order(ToyDataset(toy[0].partition(":")[2]), ("f01", "f00")) == ("f01", "f00")
 
 
 def test_a_bag_is_replayed_in_real_time_with_pictures(bag, tmp_path):

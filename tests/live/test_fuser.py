@@ -248,7 +248,8 @@ def test_a_detector_that_raises_is_reported_and_the_rest_goes_on():
     messages = [m for i in range(4) for m in (LidarBoxes(0.1 * i, boxes3d(street(i))), Image(0.1 * i, "left", pixels))]
     results = run(target, messages)
     assert len(results) == 4
-    assert "failed 4 times, last RuntimeError: no memory" in entry(target, "camera left")["message"]
+    message = entry(target, "camera left")["message"]
+    assert "failed 4 times in the latest 30 s, last RuntimeError: no memory" in message
 
 
 def test_a_detector_that_hangs_costs_the_deadline_and_drops_what_waited():
@@ -349,3 +350,14 @@ def test_settings_that_cannot_work_are_refused():
         SyncSettings(tolerance=0.0)
     with pytest.raises(ConfigError, match="no camera"):
         fuser(offsets={"rear": 0.01})
+
+
+def test_the_watch_waits_while_a_message_is_taken_in():
+    target = fuser(realtime=True, watch=WatchSettings(every=1))
+    with target._lock:
+        for message in stream(3):
+            target.push(message)
+        assert not target._workers["watch"].wait_idle(0.2)
+    assert target._workers["watch"].wait_idle(20)
+    assert target.watch.report("left").frames >= 1
+    target.close()

@@ -127,6 +127,10 @@ def test_diagnostics_go_out_and_a_broken_message_is_told_once(monkeypatch):
     for _ in range(3):
         node.receive("lidar/points", cut)
     assert len(node.warnings) == 1
+    # a trouble that lasts is told again after a while
+    monkeypatch.setattr("lcf3d.live.ros2.monotonic", lambda: 1e9)
+    node.receive("lidar/points", cut)
+    assert len(node.warnings) == 2
     node.receive("lidar/points", whole)
     send(node, 1.0)
     assert len(node.publishers["fused/detections"].sent) == 1

@@ -47,10 +47,10 @@ def live(
     """
     import json
 
-    from lcf3d.fusion.memory_config import MemoryConfig
     from lcf3d.live.outputs import Outputs
-    from lcf3d.live.replay import make_fuser, replay
-    from lcf3d.run.setup import RunRequest, find_calibration, make_fusion, read_inputs
+    from lcf3d.live.replay import in_order, make_fuser, replay
+    from lcf3d.live.warming import settle_memory
+    from lcf3d.run.setup import RunRequest, calibrated_fusion, find_calibration, read_inputs
 
     request = RunRequest(
         dataset, lidar, {"*": camera}, split=split, tables=tables, config=config, changes=tuple(set_ or ()),
@@ -60,45 +60,50 @@ def live(
     frame_ids = inputs.frame_ids[:frames]
     if not frame_ids:
         raise ConfigError(f"{dataset} has no frames to replay")
+    if memory:
+        frame_ids = in_order(inputs.dataset, frame_ids)
+    inputs = inputs._replace(frame_ids=frame_ids)
     scores = find_calibration(calibration, inputs.dataset, frame_ids, inputs.lidar, inputs.cameras, inputs.config)
-    fusion = make_fusion(inputs.config, inputs.localizer, scores)
+    fusion, notes = calibrated_fusion(inputs, scores)
     first = inputs.dataset.frame(frame_ids[0])
     fuser = make_fuser(
-        fusion, inputs.lidar, inputs.cameras, first, realtime=rate > 0, correct=self_calibrate,
-        memory=MemoryConfig() if memory else None,
+        fusion, inputs.lidar, inputs.cameras, first, realtime=rate > 0, correct=self_calibrate, memory=memory
     )  # fmt: skip
     outputs = Outputs(
         fuser, rate > 0, pictures=pictures, rerun=rerun, health=health, cameras=inputs.dataset.used_cameras
     )
     fuser.warm_up()
+    outputs.warm_up()
+    settle_memory()
     report = replay(
         inputs.dataset, frame_ids, inputs.lidar, inputs.cameras, fuser, rate=rate, hertz=hertz,
         shown=pictures is not None or rerun is not None, on_results=outputs,
     )  # fmt: skip
     made = outputs.close()
     if json_:
-        typer.echo(json.dumps({**report.to_json(), "outputs": made}, indent=2))
+        typer.echo(json.dumps({**report.to_json(), "outputs": made, "left_out": notes}, indent=2))
     else:
-        _print(report, made)
+        _print(report, [*made, *notes])
 
 
-def _print(report: ReplayReport, made: list[str]) -> None:
+def _print(report: ReplayReport, sentences: list[str]) -> None:
     """The report for people."""
-    from rich.console import Console
     from rich.table import Table
 
-    console = Console(markup=False, highlight=False)
-    console.print(
+    from lcf3d.cli.console import console
+
+    out = console()
+    out.print(
         f"{report.frames} frames in {report.seconds:.1f} s: {report.results} results, {report.behind} behind time"
     )
     table = Table("stage", "median ms", "99th percentile")
     for part, values in report.latency_ms.items():
         table.add_row(part, f"{values['median']:.2f}", f"{values['p99']:.2f}")
-    console.print(table)
-    for sentence in made:
-        console.print(sentence, soft_wrap=True)
+    out.print(table)
+    for sentence in sentences:
+        out.print(sentence, soft_wrap=True)
     for cause, count in report.dropped.items():
-        console.print(f"dropped, {cause}: {count}")
+        out.print(f"dropped, {cause}: {count}")
     for status in report.diagnostics:
         level = ("ok", "warning", "error", "silent")[status["level"]]
-        console.print(f"{status['hardware_id']}: {level}, {status['message']}", soft_wrap=True)
+        out.print(f"{status['hardware_id']}: {level}, {status['message']}", soft_wrap=True)

@@ -10,6 +10,7 @@ time offset (seconds; positive when the camera looked later than its time stamp 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -199,7 +200,14 @@ def realigned(camera: Camera, rotation: FloatArray, displacement: FloatArray | N
     return replace(camera, camera_from_lidar=step @ camera.camera_from_lidar)
 
 
-def fit_alignment(pairs: BoxPairs, start: Alignment, *, time: bool = False, displacement: bool = True) -> Alignment:
+def fit_alignment(
+    pairs: BoxPairs,
+    start: Alignment,
+    *,
+    time: bool = False,
+    displacement: bool = True,
+    pause: Callable[[], None] = lambda: None,
+) -> Alignment:
     """The state that makes the edges of projected boxes and 2D boxes agree.
 
     Args:
@@ -207,6 +215,7 @@ def fit_alignment(pairs: BoxPairs, start: Alignment, *, time: bool = False, disp
         start: where the iteration begins.
         time: also estimate the time offset, which needs velocities.
         displacement: also estimate the displacement; what cannot be told from a rotation stays near zero.
+        pause: called before each step.
 
     Returns:
         The estimate with its covariance: of independent pairs, and what the gradients of `BoxPairs.groups` scatter
@@ -225,6 +234,7 @@ def fit_alignment(pairs: BoxPairs, start: Alignment, *, time: bool = False, disp
         return Alignment(np.zeros(STATE), np.diag(prior**2))
     scale = 1.0
     for _ in range(ITERATIONS):
+        pause()
         residuals, jacobian = _edges(pairs, state)
         used = pairs.free & np.isfinite(residuals)
         r, j = residuals[used], jacobian[used]

@@ -101,6 +101,8 @@ class AlignmentWatch:
     Args:
         class_names: the classes that take part, by name in both branches.
         settings: see `WatchSettings`.
+        pause: called every fraction of a millisecond or so of an estimate; a watch in a thread of its own waits there
+            while others have something more urgent to do.
 
     Example:
         >>> watch = AlignmentWatch(("Car", "Pedestrian"))  # doctest: +SKIP
@@ -109,9 +111,15 @@ class AlignmentWatch:
         'ok'
     """
 
-    def __init__(self, class_names: Iterable[str], settings: WatchSettings | None = None) -> None:
+    def __init__(
+        self,
+        class_names: Iterable[str],
+        settings: WatchSettings | None = None,
+        pause: Callable[[], None] = lambda: None,
+    ) -> None:
         self.class_names = tuple(class_names)
         self.settings = settings or WatchSettings()
+        self._pause = pause
         self._sightings: dict[str, deque[Matcher]] = {}
         self._estimates: dict[str, Alignment] = {}
         self._seen: dict[str, int] = {}
@@ -152,6 +160,7 @@ class AlignmentWatch:
         kept = self._sightings.setdefault(view.name, deque(maxlen=self.settings.window))
         count = self._seen.get(view.name, 0)
         self._seen[view.name] = count + 1
+        self._pause()
         kept.append(Matcher(Sighting.of(view, boxes, found, velocities, count // CORRELATED)))
         # the cameras take turns, so that no frame has to wait for all of them
         if (count + 1 + list(self._sightings).index(view.name)) % self.settings.every == 0:
@@ -161,9 +170,9 @@ class AlignmentWatch:
         """A new estimate, of the latest frames alone if the camera has just moved."""
         settings, matchers = self.settings, list(kept)
         before = self.estimate(name)
-        renewed = _estimate(matchers, before, time=settings.time)
+        renewed = _estimate(matchers, before, time=settings.time, pause=self._pause)
         if len(matchers) > settings.recent:
-            latest = _estimate(matchers[-settings.recent :], renewed, time=settings.time)
+            latest = _estimate(matchers[-settings.recent :], renewed, time=settings.time, pause=self._pause)
             moved = latest.surely_beyond(settings.sure, renewed)
             if latest.pairs >= FEWEST_PAIRS and np.rad2deg(moved) > settings.drifting_deg:
                 while len(kept) > settings.recent:
@@ -206,20 +215,28 @@ def estimate(sightings: list[Sighting], start: Alignment, *, time: bool = False)
     return _estimate([Matcher(sighting) for sighting in sightings], start, time=time)
 
 
-def _estimate(matchers: list[Matcher], start: Alignment, *, time: bool) -> Alignment:
-    """As `estimate`."""
+def _estimate(
+    matchers: list[Matcher], start: Alignment, *, time: bool, pause: Callable[[], None] = lambda: None
+) -> Alignment:
+    """As `estimate`, with what `AlignmentWatch` may call in between."""
     sightings = [matcher.sighting for matcher in matchers]
     state, known = start.state, start.pairs >= FEWEST_PAIRS
     voted = np.zeros_like(state)
+    pause()
     voted[:3] = vote_rotation(sightings)
+    pause()
     if np.linalg.norm(voted[:2] - state[:2]) > np.deg2rad(0.4):
         before, after = (sum(match_sighting(s, st, COARSE_IOU)[1] for s in sightings) for st in (state, voted))
         if after > BETTER * before + 0.5:
             state, known = voted, False
     current = replace(start, state=state)
     for threshold in (FINE_IOU,) if known else np.linspace(COARSE_IOU, FINE_IOU, 5):
-        pairs = BoxPairs.concatenate([matcher.pairs(current.state, float(threshold)) for matcher in matchers])
-        current = fit_alignment(pairs, current, time=time)
+        found = []
+        for matcher in matchers:
+            pause()
+            found.append(matcher.pairs(current.state, float(threshold)))
+        pairs = BoxPairs.concatenate(found)
+        current = fit_alignment(pairs, current, time=time, pause=pause)
     return current
 
 

@@ -16,7 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from lcf3d.errors import ConfigError
 from lcf3d.files import read_json, write_text
 from lcf3d.fusion.evidence import Evidence, to_probability
-from lcf3d.fusion.memory_config import ClassMemory
+from lcf3d.fusion.memory_config import ClassMemory, MemoryConfig
 from lcf3d.remote.places import local
 from lcf3d.structures import Detections, Detections2D, Detections3D, FloatArray, with_columns
 
@@ -172,6 +172,18 @@ def load_calibration(text: str) -> Calibration | None:
     if text == "auto":
         raise ConfigError("'auto' calibrates on the frames of a run: see lcf3d.fusion.self_calibration")
     return Calibration.load(local(text))
+
+
+def memory_settings(calibration: Calibration | None, settings: MemoryConfig | None = None) -> MemoryConfig:
+    """Settings of the memory of recent frames; classes that they leave out take the weights of a calibration.
+
+    Args:
+        calibration: of the detectors; None without any.
+        settings: the defaults if None.
+    """
+    chosen = settings or MemoryConfig()
+    fitted = calibration.memory if calibration else {}
+    return chosen.model_copy(update={"classes": {**fitted, **chosen.classes}})
 
 
 def ground_height(bottoms: FloatArray) -> float | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -14,10 +15,13 @@ from lcf3d.detectors.base import CameraDetector, LidarDetector
 from lcf3d.errors import ConfigError
 from lcf3d.frame import Frame
 from lcf3d.fusion.alignment_watch import AlignmentWatch
+from lcf3d.fusion.calibration import memory_settings
 from lcf3d.fusion.memory import remember
 from lcf3d.fusion.memory_config import MemoryConfig
 from lcf3d.fusion.memory_state import Memory
 from lcf3d.fusion.pipeline import LateCascadeFusion
+from lcf3d.live.counting import Tally
+from lcf3d.live.diagnostics import Diagnostics
 from lcf3d.live.health import Health
 from lcf3d.live.messages import (
     CameraBoxes,
@@ -28,17 +32,20 @@ from lcf3d.live.messages import (
     Message,
     Scan,
     is_whole,
+    plain_points,
     same_mount,
     source_of,
 )
 from lcf3d.live.poses import PoseBuffer
 from lcf3d.live.settings import LiveResult, LiveSettings
 from lcf3d.live.synchronizer import CameraPart, Group, Synchronizer
-from lcf3d.live.warming import warm_up
+from lcf3d.live.warming import made_up_cameras, rehearsal
 from lcf3d.live.watching import WatchFeed
 from lcf3d.live.workers import Worker, attempt
 from lcf3d.provenance import FusedDetections
 from lcf3d.structures import Camera, Detections2D, Detections3D
+
+log = logging.getLogger(__name__)
 
 
 class Fuser:
@@ -50,7 +57,8 @@ class Fuser:
         lidar_detector: runs on each `Scan`; without it `LidarBoxes` are pushed.
         camera_detectors: run on each `Image`, by camera name; cameras without one push `CameraBoxes`.
         settings: see `LiveSettings`.
-        memory: settings of the memory of recent frames, see `lcf3d.fusion.memory`; None to judge every moment alone.
+        memory: whether recent frames testify too, as with ``lcf3d run --memory``, see `lcf3d.fusion.memory`; or its
+            settings. Classes that these leave out have the weights of the fusion's calibration.
         on_result: called with each result as soon as it is there, before health and the watch take their time.
 
     Raises:
@@ -71,11 +79,12 @@ class Fuser:
         lidar_detector: LidarDetector | None = None,
         camera_detectors: Mapping[str, CameraDetector] | None = None,
         settings: LiveSettings | None = None,
-        memory: MemoryConfig | None = None,
+        memory: MemoryConfig | bool = False,
         on_result: Callable[[LiveResult], None] | None = None,
     ) -> None:
         self.fusion, self.settings = fusion, settings or LiveSettings()
-        self._memory_config = memory
+        given = memory if isinstance(memory, MemoryConfig) else None
+        self._memory_config = memory_settings(fusion.calibration, given) if memory else None
         self._memory: Memory | None = None
         self._on_result = on_result
         self._models: dict[str, list[tuple[float, Camera]]] = {c.name: [(-np.inf, c)] for c in cameras}
@@ -87,15 +96,15 @@ class Fuser:
             raise ConfigError(
                 f"there is no camera {sorted(named - set(self._models))}; the cameras are {sorted(self._models)}"
             )
-        self._sync = Synchronizer(self.settings.sync)
-        self._poses = PoseBuffer()
-        watch = self.settings.watch
-        self.watch = AlignmentWatch(fusion.config.class_names, watch) if watch is not None else None
         self.health = Health(fusion.config.class_names)
+        self._sync = Synchronizer(self.settings.sync, Tally(self.health.clock))
+        self._poses = PoseBuffer()
+        self._lock = threading.RLock()
+        watch, names = self.settings.watch, fusion.config.class_names
+        self.watch = None if watch is None else AlignmentWatch(names, watch, self._let_pass)
         self._workers: dict[str, Worker] = {}
         self._detect_ms: dict[tuple[str, float], float] = {}
         self._results: list[LiveResult] = []
-        self._lock = threading.RLock()
         self._feed: WatchFeed | None = None
         if self.watch is not None:
             workers = self._workers if self.settings.realtime else None
@@ -124,14 +133,41 @@ class Fuser:
         self._workers.clear()
 
     def warm_up(self) -> None:
-        """Load, compile and run everything once on made-up input: the first real frame is then as quick as others."""
+        """Load, compile and run everything on a made-up stream: the first real frame is then as quick as others.
+
+        A detector that fails on it is reported and stops nothing.
+        """
         with self._lock:
-            warm_up(self.fusion, [self._model(name, np.inf) for name in self._models], self._detectors)
+            known = [replace(self._model(name, np.inf), delay=0.0) for name in self._models]
+        cameras = known or made_up_cameras()
+        for detectors in ({}, self._detectors) if self._detectors else ({},):
+            twin = self._twin(cameras, detectors)
+            for message in rehearsal(cameras, self.fusion.config.class_names, detectors):
+                twin.push(message)
+            twin.flush()
+            twin.diagnostics()
+            for source, error in twin.health.last_error.items():
+                log.warning("%s failed on the made-up stream of the warm-up: %s", source, error)
+                self.health.tell(f"{source} failed at the warm-up: {error}")
+
+    def _twin(self, cameras: Sequence[Camera], detectors: Mapping[str, Any]) -> Fuser:
+        """A fuser with the same parts, to rehearse with: nothing in threads, and its watch looks at every moment."""
+        watch = self.settings.watch
+        settings = replace(
+            self.settings,
+            sync=replace(self.settings.sync, offsets={}),
+            realtime=False,
+            watch=None if watch is None else replace(watch, every=1, recent=2),
+            watch_period=0.0,
+        )
+        twin = Fuser(self.fusion, cameras, settings=settings, memory=self._memory_config or False)
+        twin._detectors = dict(detectors)
+        return twin
 
     def dropped(self) -> dict[str, int]:
         """Messages left out, by ``source: cause``."""
         with self._lock:
-            return {f"{source}: {cause}": count for (source, cause), count in sorted(self._sync.dropped.items())}
+            return {f"{source}: {cause}": count for (source, cause), count in sorted(self._sync.dropped.total.items())}
 
     def turned_deg(self) -> dict[str, float]:
         """How far each camera has turned against its calibration, in degrees, as far as the watch knows."""
@@ -151,7 +187,8 @@ class Fuser:
                 if worker.busy_since is not None
             }
             late = {name: s for name, s in hanging.items() if s > self.settings.sync.deadline}
-            return self.health.diagnostics(self._sync, reports, list(self._models), late)
+            quiet = self.health.quiet(perf_counter()) if self.settings.realtime else 0.0
+            return Diagnostics(self.health, self._sync, reports, late, quiet).entries(list(self._models))
 
     def _locked(self, action: Callable[[], None], everything: bool = False) -> list[LiveResult]:
         with self._lock:
@@ -159,6 +196,14 @@ class Fuser:
             self._advance(everything)
             results, self._results = self._results, []
             return results
+
+    def _let_pass(self) -> None:
+        """The watch in its thread waits while a message is being taken in: it must not hold up a result.
+
+        Python's own turns between threads are 5 ms long.
+        """
+        with self._lock:
+            pass
 
     def _take(self, message: Message, arrival: float) -> None:
         source = source_of(message)
@@ -168,7 +213,7 @@ class Fuser:
         if isinstance(message, Image | CameraBoxes) and message.camera not in self._models:
             self.health.tell_once(f"camera {message.camera} has no calibration yet: its messages wait for one")
         if not is_whole(message):
-            self._sync.dropped[source, "broken"] += 1
+            self._sync.dropped.add((source, "broken"))
             return
         self.health.saw(source, message, arrival)
         restarts = self._sync.restarts
@@ -181,6 +226,7 @@ class Fuser:
             self._poses.add(message.time, message.world_from_lidar)
             return
         if isinstance(message, Scan):
+            message = replace(message, points=plain_points(message.points))
             self._sync.add_scan(message.time, message.points, arrival)
         if source in self._detectors and isinstance(message, Scan | Image):
             self._detect(source, message, arrival)
@@ -193,7 +239,7 @@ class Fuser:
 
     def _begin_anew(self) -> None:
         """Time went back: poses are of another time, and the latest calibrations hold from now on."""
-        self.health.tell("time went back: everything began anew")
+        self.health.began_anew()
         self._poses.clear()
         for name, known in self._models.items():
             self._models[name] = [(-np.inf, known[-1][1])]
@@ -242,7 +288,7 @@ class Fuser:
 
             self._workers[source] = Worker(source, work, done)
         if not self._workers[source].submit((message, arrival)):
-            self._sync.dropped[source, "busy"] += 1
+            self._sync.dropped.add((source, "busy"))
 
     def _detected(
         self, source: str, message: Scan | Image, result: Any, error: Exception | None, spent: float, arrival: float
@@ -259,7 +305,7 @@ class Fuser:
             if message.time > self._sync.closed:
                 self._sync.add_lidar(message.time, result, arrival)
             else:
-                self._sync.dropped["lidar", "late"] += 1
+                self._sync.dropped.add(("lidar", "late"))
         else:
             self._sync.add_camera(message.camera, CameraPart(message.time, result, message.pixels, arrival))
 

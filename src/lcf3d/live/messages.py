@@ -12,7 +12,7 @@ from lcf3d.structures import Camera, Detections2D, Detections3D, FloatArray
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """A LiDAR scan: (N, 4 or more) float32 points in the LiDAR frame at ``time``."""
+    """A LiDAR scan: (N, 3 or more) points x, y, z, intensity, ... in the LiDAR frame at ``time``."""
 
     time: float
     points: NDArray[np.float32]
@@ -84,6 +84,16 @@ def is_whole(message: Message) -> bool:
     if isinstance(message, LidarBoxes):
         return isinstance(message.detections, Detections3D)
     return not isinstance(message, CameraBoxes) or isinstance(message.detections, Detections2D)
+
+
+def plain_points(points: NDArray[np.floating]) -> NDArray[np.float32]:
+    """(N, 4 or more) writable float32 points, row after row, of (N, 3 or more); without intensity it is 0.
+
+    Of another layout, or of memory that cannot be written to, compiled functions would be compiled anew.
+    """
+    if np.shape(points)[1] == 3:
+        points = np.concatenate([points, np.zeros((len(points), 1), np.float32)], axis=1)
+    return np.require(points, np.float32, ["C_CONTIGUOUS", "WRITEABLE"])
 
 
 def same_mount(camera: Camera, other: Camera) -> bool:

@@ -9,13 +9,19 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from lcf3d.errors import ConfigError
+from lcf3d.frame import Frame
+from lcf3d.fusion.warm_up import warm_up_frame
 from lcf3d.live.fuser import Fuser
 from lcf3d.live.settings import LiveResult
 from lcf3d.live.workers import Worker
+from lcf3d.provenance import FusedDetections
 from lcf3d.visualization.trails import Trails
+
+if TYPE_CHECKING:
+    import PIL.Image
 
 # seconds of the stream between two lines of health
 HEALTH_PERIOD = 1.0
@@ -123,6 +129,12 @@ class Outputs:
             self._said = results[-1].time
             self._lines.append(json.dumps({"time": self._said, "status": self._fuser.diagnostics()}))
 
+    def warm_up(self) -> None:
+        """Compile what draws, so that the first picture does not take time from the first frames."""
+        if any(output.name == "pictures" for output, _ in self._outputs):
+            frame, lidar, camera = warm_up_frame(self._fuser.fusion.config.class_names)
+            _picture(frame, self._fuser.fusion(frame, lidar, camera), Trails())
+
     def close(self) -> list[str]:
         """Finish everything; a sentence each of what was made."""
         for output, _ in self._outputs:
@@ -145,8 +157,13 @@ class Outputs:
 
 def draw_result(result: LiveResult, folder: Path, trails: Trails) -> None:
     """A PNG of a result, named by its time in seconds; tracks with the ways that they came since the one before."""
-    from lcf3d.visualization.png import draw_frame, save_png
+    from lcf3d.visualization.png import save_png
+
+    save_png(_picture(result.frame, result.fused, trails), folder / f"{result.time:010.3f}.png")
+
+
+def _picture(frame: Frame, fused: FusedDetections, trails: Trails) -> PIL.Image.Image:
+    from lcf3d.visualization.png import draw_frame
     from lcf3d.visualization.scene import Scene
 
-    picture = draw_frame(result.frame, Scene.from_fused(result.fused, trails=trails(result.frame, result.fused)))
-    save_png(picture, folder / f"{result.time:010.3f}.png")
+    return draw_frame(frame, Scene.from_fused(fused, trails=trails(frame, fused)))

@@ -18,6 +18,7 @@ from lcf3d.live.fuser import Fuser
 from lcf3d.live.messages import CameraBoxes, CameraModel, EgoPose, Image, LidarBoxes, Message, Scan
 from lcf3d.live.settings import LiveResult, LiveSettings
 from lcf3d.live.synchronizer import SyncSettings
+from lcf3d.run.sequences import places_in_order
 from lcf3d.run.sources import CameraOnImages, LidarOnScans
 from lcf3d.structures import Camera
 
@@ -117,6 +118,12 @@ def _same(camera: Camera, other: Camera | None) -> bool:
     )
 
 
+def in_order(dataset: Dataset, frame_ids: Sequence[str]) -> tuple[str, ...]:
+    """Whole sequences, each by time, as a memory of past frames needs them; as they are where no frame tells."""
+    groups = places_in_order(map(dataset.frame, frame_ids), told=False)
+    return tuple(frame_ids[place] for group in groups for place in group)
+
+
 def make_fuser(
     fusion: LateCascadeFusion,
     lidar: LidarSource,
@@ -126,7 +133,7 @@ def make_fuser(
     realtime: bool,
     correct: bool = False,
     watch: WatchSettings | None = None,
-    memory: MemoryConfig | None = None,
+    memory: MemoryConfig | bool = False,
     on_result: Callable[[LiveResult], None] | None = None,
 ) -> Fuser:
     """The `Fuser` that belongs to two branches of a dataset."""

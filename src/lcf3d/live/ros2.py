@@ -6,6 +6,7 @@ What it reads and writes is in `lcf3d.formats.ros_messages`. Its parameters are 
 from __future__ import annotations
 
 from importlib import import_module
+from time import monotonic
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,7 @@ from lcf3d.live.fuser import Fuser
 from lcf3d.live.messages import CameraBoxes, CameraModel, EgoPose, LidarBoxes, Message, Scan
 from lcf3d.live.settings import LiveResult, LiveSettings
 from lcf3d.live.synchronizer import SyncSettings
+from lcf3d.live.warming import settle_memory
 from lcf3d.structures import Camera, FloatArray
 
 PARAMETERS: dict[str, tuple[Any, str]] = {
@@ -45,6 +47,8 @@ CAMERA_PARAMETERS: dict[str, tuple[Any, str]] = {
 }
 # stamps of messages kept, so that a result has its scan's to the nanosecond
 STAMPS = 256
+# seconds before the same warning is given again
+QUIET = 60.0
 
 
 class FuserNode:
@@ -86,7 +90,7 @@ class FuserNode:
         self.names = config.class_names
         self._stamps: dict[float, Any] = {}
         self._models: dict[str, bytes] = {}
-        self._told: set[str] = set()
+        self._told: dict[str, float] = {}
         self._connect()
 
     def _connect(self) -> None:
@@ -125,15 +129,17 @@ class FuserNode:
         return bool(self._values["messages"] == "autoware")
 
     def _guarded(self, callback: Any) -> Any:
-        """A callback whose errors are told once each and stop nothing."""
+        """A callback whose errors stop nothing and are told, each again after `QUIET` seconds at the soonest."""
 
         def guarded(*arguments: Any) -> None:
             try:
                 callback(*arguments)
             except Lcf3dError as error:
-                if str(error) not in self._told:
-                    self._told.add(str(error))
-                    self.node.get_logger().warning(str(error))
+                now, text = monotonic(), str(error)
+                self._told = {told: when for told, when in self._told.items() if now - when < QUIET}
+                if text not in self._told:
+                    self._told[text] = now
+                    self.node.get_logger().warning(text)
 
         return guarded
 
@@ -250,6 +256,7 @@ def spin(arguments: list[str] | None = None) -> None:
         listener = tf2_ros.TransformListener(buffer, node)
         shell = FuserNode(node, buffer)
         shell.fuser.warm_up()
+        settle_memory()
         rclpy.spin(node)
         del listener
     except KeyboardInterrupt:

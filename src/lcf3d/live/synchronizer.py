@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -11,10 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lcf3d.errors import ConfigError
+from lcf3d.live.counting import Tally
 from lcf3d.structures import Detections2D, Detections3D
 
 # a sensor whose time is further than this from the LiDAR's has another clock (seconds)
 CLOCK_LIMIT = 5.0
+# the same of one that is ahead, which no waiting explains, unless the deadline is longer
+AHEAD = 1.0
 # messages of one camera that are kept at most
 MOST_MESSAGES = 64
 
@@ -89,24 +91,30 @@ class Synchronizer:
 
     Args:
         settings: see `SyncSettings`.
+        dropped: counts what is left out; a new one without it.
 
     Attributes:
         dropped: how many messages were left out, by ``(source, cause)``; causes are ``late``, ``clock``,
-            ``duplicate``, ``broken`` (its time is no number, or its data has no such shape) and ``overflow``.
+            ``no lidar`` (the LiDAR has been silent for long), ``duplicate``, ``broken`` (its time is no number, or its
+            data has no such shape), ``overflow`` and ``busy`` (its detector was at another message).
         clocks: seconds that the clock of a source is ahead of the LiDAR's, by source, where that is too much.
         closed: time of the newest group that was handed out.
         restarts: how often time went back by more than `CLOCK_LIMIT` and everything began anew.
     """
 
-    def __init__(self, settings: SyncSettings) -> None:
+    def __init__(self, settings: SyncSettings, dropped: Tally[tuple[str, str]] | None = None) -> None:
         self.settings = settings
-        self.dropped: Counter[tuple[str, str]] = Counter()
+        self.dropped: Tally[tuple[str, str]] = Tally() if dropped is None else dropped
         self.clocks: dict[str, float] = {}
         self.restarts = 0
         self._groups: dict[float, Group] = {}
         self._cameras: dict[str, dict[float, CameraPart]] = {}
         self._watermark = -np.inf
         self._newest_lidar: float | None = None
+        # of every other source, the time of its newest message that fitted the LiDAR's clock
+        self._fitted: dict[str, float] = {}
+        # a message further ahead of the LiDAR's than this is no late LiDAR any more
+        self._ahead = min(CLOCK_LIMIT, max(AHEAD, 2 * settings.deadline))
         self.closed = -np.inf
 
     @property
@@ -125,13 +133,24 @@ class Synchronizer:
             if time <= self.closed:
                 return self._drop(source, "late")
             self._newest_lidar = time if self._newest_lidar is None else max(self._newest_lidar, time)
-        elif self._newest_lidar is not None and abs(time - self._newest_lidar) > CLOCK_LIMIT:
-            self.clocks.setdefault(source, time - self._newest_lidar)
-            return self._drop(source, "clock")
-        else:
+        elif self._newest_lidar is not None:
+            if not -CLOCK_LIMIT <= time - self._newest_lidar <= self._ahead:
+                return self._misfit(source, time, time - self._newest_lidar)
             self.clocks.pop(source, None)
-        self._watermark = time if of_lidar and time < self._watermark - CLOCK_LIMIT else max(self._watermark, time)
+            self._fitted[source] = max(time, self._fitted.get(source, time))
+        # what came before the LiDAR's first message may have another clock
+        self._watermark = time if of_lidar and time < self._watermark - self._ahead else max(self._watermark, time)
         return True
+
+    def _misfit(self, source: str, time: float, lead: float) -> bool:
+        """A message far from the LiDAR's newest: the LiDAR has fallen silent, or a clock is off."""
+        if source in self._fitted and 0 < time - self._fitted[source] <= self._ahead:
+            # it goes on as it did; the LiDAR does not
+            self._fitted[source] = time
+            return self._drop(source, "no lidar")
+        self._fitted.pop(source, None)
+        self.clocks.setdefault(source, lead)
+        return self._drop(source, "clock")
 
     def add_lidar(self, time: float, detections: Detections3D, arrival: float) -> None:
         """3D detections of a scan; `admit` has let them in."""
@@ -232,9 +251,11 @@ class Synchronizer:
         self.restarts += 1
         self._groups.clear()
         self._cameras.clear()
+        self._fitted.clear()
+        self.clocks.clear()
         self.closed = self._watermark = -np.inf
         self._newest_lidar = None
 
     def _drop(self, source: str, cause: str) -> bool:
-        self.dropped[source, cause] += 1
+        self.dropped.add((source, cause))
         return False

@@ -20,8 +20,8 @@ def in_order(dataset: Dataset, frame_ids: Sequence[str]) -> list[list[str]]:
     return [[frame_ids[place] for place in group] for group in places_in_order(map(dataset.frame, frame_ids))]
 
 
-def places_in_order(frames: Iterable[Frame]) -> list[list[int]]:
-    """The same by place: groups of indices into ``frames``; see `in_order`."""
+def places_in_order(frames: Iterable[Frame], told: bool = True) -> list[list[int]]:
+    """The same by place: groups of indices into ``frames``; see `in_order`. ``told``: some frame has to tell."""
     groups: dict[str, list[tuple[float, int]]] = {}
     result: list[list[int]] = []
     placed: dict[str, int] = {}
@@ -35,7 +35,7 @@ def places_in_order(frames: Iterable[Frame]) -> list[list[int]]:
             placed[frame.sequence] = len(result)
             result.append([])
         groups.setdefault(frame.sequence, []).append((frame.timestamp, place))
-    if first is not None and not groups:
+    if told and first is not None and not groups:
         raise DatasetError(
             f"no frame tells its sequence and time (first {first}), so there is no past to remember; leave --memory "
             "out, or give the frames of a drive (KITTI: ids SEQUENCE_FRAME)"

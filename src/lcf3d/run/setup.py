@@ -13,10 +13,9 @@ from lcf3d.datasets.opening import open_dataset
 from lcf3d.errors import ConfigError, DatasetError
 from lcf3d.files import write_json
 from lcf3d.fusion.alignment import Alignment
-from lcf3d.fusion.calibration import Calibration, load_calibration
+from lcf3d.fusion.calibration import Calibration, load_calibration, memory_settings
 from lcf3d.fusion.config import FusionConfig
 from lcf3d.fusion.localizer import Localizer
-from lcf3d.fusion.memory_config import MemoryConfig
 from lcf3d.fusion.pipeline import LateCascadeFusion
 from lcf3d.fusion.self_calibration import self_calibrate
 from lcf3d.fusion.stereo import StereoConfig, StereoLateCascadeFusion
@@ -139,7 +138,8 @@ def prepare_run(
     """
     require_form(request.form)
     # a shard reads and calibrates like the whole run, so that its results are those of the whole
-    dataset, frame_ids, config, lidar, cameras, localizer = read_inputs(request, settings=settings)
+    inputs = read_inputs(request, settings=settings)
+    dataset, frame_ids, config, lidar, cameras, localizer = inputs
     own_ids = frames_of_shard(frame_ids, request.shard)
     if request.shard is not None and (request.memory or request.smooth):
         raise ConfigError("--shard takes drives apart, and --memory and --smooth need them whole; leave one out")
@@ -157,12 +157,7 @@ def prepare_run(
         calibration = find_calibration(
             request.calibration, dataset, frame_ids, lidar, cameras, config, runner.alignment
         )
-    for source, maps in ((lidar, "lidar"), *((camera, "camera") for camera in cameras.values())):
-        require = getattr(source, "require_probabilities", None)
-        if require is not None:
-            require(getattr(calibration, maps) if calibration else ())
-    reported = reported_classes(cameras, config, len(frame_ids))
-    notes = (*left_out_notes(lidar, cameras), *report_notes(reported, config), *score_notes(config))
+    runner.fusion, notes = calibrated_fusion(inputs, calibration)
     written: dict[str, Any] = {
         "lcf3d": __version__,
         **asdict(request),
@@ -176,9 +171,8 @@ def prepare_run(
             log.warning("camera %s: %s (%s)", name, describe(whole), whole.status)
     if calibration is not None:
         calibration.dump(folder.calibration_path)
-    runner.fusion = make_fusion(config, localizer, calibration, reported)
     if request.memory or request.smooth:
-        runner.memory = MemoryConfig(classes=calibration.memory if calibration else {})
+        runner.memory = memory_settings(calibration)
     return Run(dataset, own_ids, config, runner, folder, request, notes)
 
 
@@ -281,6 +275,25 @@ def make_fusion(
     if isinstance(config, StereoConfig):
         return StereoLateCascadeFusion(config, localizer, calibration=calibration, reports=reports)
     return LateCascadeFusion(config, localizer, calibration=calibration, reports=reports)
+
+
+def calibrated_fusion(inputs: Inputs, calibration: Calibration | None) -> tuple[LateCascadeFusion, tuple[str, ...]]:
+    """The fusion that runs, and what is to be said once: what is left out, and which classes no camera is asked about.
+
+    Raises:
+        ConfigError: scores that are no probabilities and have no score map.
+    """
+    for source, maps in ((inputs.lidar, "lidar"), *((camera, "camera") for camera in inputs.cameras.values())):
+        require = getattr(source, "require_probabilities", None)
+        if require is not None:
+            require(getattr(calibration, maps) if calibration else ())
+    reported = reported_classes(inputs.cameras, inputs.config, len(inputs.frame_ids))
+    notes = (
+        *left_out_notes(inputs.lidar, inputs.cameras),
+        *report_notes(reported, inputs.config),
+        *score_notes(inputs.config),
+    )
+    return make_fusion(inputs.config, inputs.localizer, calibration, reported), notes
 
 
 def find_calibration(
