@@ -87,11 +87,11 @@ def paper(
 
 def _simulated(kinds: set[str], folder: Path) -> dict[str, Path]:
     """Folders of simulated frames by kind of dataset; what is there is taken."""
-    from lcf3d.paper.rehearsal import DATA, FRAMES
+    from lcf3d.paper.rehearsal import DATA
     from lcf3d.simulation.writer import Recipe, write_dataset
 
     for kind in sorted(kinds):
-        write_dataset(Recipe(DATA[kind], FRAMES), folder / kind, resume=True)
+        write_dataset(Recipe(*DATA[kind]), folder / kind, resume=True)
     return {kind: folder / kind for kind in sorted(kinds)}
 
 
@@ -173,7 +173,11 @@ def _measured(table: Table, rows: tuple[Row, ...], place: Workplace) -> dict[str
     if table.measure == "cost":
         from lcf3d.paper.cost import cost_rows, measure_costs
 
-        return cost_rows(table, rows, measure_costs(_fusion_ms, place.device), place.device)
+        try:
+            costs = measure_costs(_fusion_ms, place.uses, place.device)
+        except NeedsError as error:
+            return {row.name: without_values(table, f"needs {error}") for row in rows}
+        return cost_rows(table, rows, costs, place.uses, place.device)
     measured = {}
     for row in rows:
         try:

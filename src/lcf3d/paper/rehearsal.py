@@ -10,20 +10,18 @@ from lcf3d.detectors.published import find_model
 from lcf3d.files import atomic_path
 from lcf3d.networks.torch import nn, torch
 
-# the camera networks are rehearsed as the smallest one of their kind that finds the same classes, on small images
+# the camera networks are rehearsed as the smallest one that finds the same classes, on small images
 _CAMERAS = {
-    "fasterrcnn-r101-kitti": (50, "kitti", False),
-    "fasterrcnn-r50-nuscenes": (50, "nuscenes", False),
-    "ddq-detr-nuscenes": (50, "nuscenes", False),
-    "detectors-nuimages": (50, "nuscenes", True),
+    "fasterrcnn-r101-kitti": ("fasterrcnn-kitti", "kitti", False),
+    "fasterrcnn-r50-nuscenes": ("maskrcnn-nuscenes", "nuscenes", True),
+    "ddq-detr-nuscenes": ("maskrcnn-nuscenes", "nuscenes", True),
+    "detectors-nuimages": ("maskrcnn-nuscenes", "nuscenes", True),
 }
 IMAGE_SIZE = "400x225"
 """Longer and shorter side of images that the camera networks see, in pixels."""
 
-DATA = {"kitti": "kitti64", "nuscenes": "nuscenes32"}
-"""Preset of the simulated frames by kind of dataset."""
-FRAMES = 2
-"""Simulated frames of each; the last one is the validation split."""
+DATA = {"kitti": ("kitti64", 2), "nuscenes": ("nuscenes32", 1)}
+"""Preset and number of the simulated frames by kind of dataset; of KITTI's, the last one is the validation split."""
 
 
 def filled_weights(names: Sequence[str], folder: Path) -> dict[str, str]:
@@ -37,22 +35,23 @@ def filled_weights(names: Sequence[str], folder: Path) -> dict[str, str]:
 
 
 def _filled(name: str, path: Path) -> str:
+    camera = _CAMERAS.get(name)
+    if camera is not None:
+        path = path.with_name(f"{camera[0]}.pth")
     if not path.is_file():
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(0)
             state = _state(name)
         with atomic_path(path) as temporary:
             torch.save({"state_dict": state}, temporary)
-    if name in _CAMERAS:
-        return f"fasterrcnn:{path}?size={IMAGE_SIZE}"
-    return str(path)
+    return str(path) if camera is None else f"fasterrcnn:{path}?size={IMAGE_SIZE}"
 
 
 def _state(name: str) -> dict[str, Any]:
     """Parameters of an untrained network that finds something."""
+    if name in _CAMERAS:
+        return _camera_state(*_CAMERAS[name][1:])
     sensor = find_model(name).sensor
-    if sensor == "camera":
-        return _camera_state(*_CAMERAS[name])
     if sensor == "localizer":
         from lcf3d.localizers.pointnet2 import FrustumPointNet2
         from lcf3d.localizers.spec import LocalizerSpec
@@ -82,11 +81,11 @@ def _state(name: str) -> dict[str, Any]:
     return state
 
 
-def _camera_state(depth: int, style: str, masks: bool) -> dict[str, Any]:
+def _camera_state(style: str, masks: bool) -> dict[str, Any]:
     from lcf3d.detectors.camera.torchvision_fasterrcnn import FasterRCNNNetwork
     from lcf3d.detectors.camera.torchvision_styles import STYLES
 
-    state: dict[str, Any] = FasterRCNNNetwork(depth, STYLES[style], masks).state_dict()
+    state: dict[str, Any] = FasterRCNNNetwork(50, STYLES[style], masks).state_dict()
     for parameter, value in state.items():
         # residual blocks that add nothing keep activations finite; large class weights make scores differ
         if parameter.endswith("bn3.weight"):
