@@ -250,7 +250,8 @@ class TorchvisionFasterRCNN:
         longer, shorter = self.style.image_size
         scale = min(longer / max(image.shape[:2]), shorter / min(image.shape[:2]))
         size = tuple(round(side * scale) for side in image.shape[:2])
-        tensor = torch.from_numpy(np.ascontiguousarray(image)).to(self.device).permute(2, 0, 1)[None].float()
+        # a copy, because images of datasets are read-only, which torch warns of
+        tensor = torch.from_numpy(np.array(image, order="C")).to(self.device).permute(2, 0, 1)[None].float()
         if size != image.shape[:2]:
             tensor = functional.interpolate(tensor, size=size, mode="bilinear", align_corners=False)
         return self.normalize(tensor), scale
