@@ -16,7 +16,9 @@ if TYPE_CHECKING:
 
 
 def paper(
-    table: Annotated[str, typer.Argument(help="list, splits, all, or one of the list, for example table-1")] = "list",
+    table: Annotated[
+        str, typer.Argument(help="list, splits, all, or one of the list, for example table-1; with --rehearse all")
+    ] = "",
     out: Annotated[Path, typer.Option(help="folder for the tables and the runs behind them")] = Path("tables"),
     kitti: Annotated[Path | None, typer.Option(help="folder of KITTI's object benchmark")] = None,
     nuscenes: Annotated[Path | None, typer.Option(help="folder of nuScenes")] = None,
@@ -31,7 +33,10 @@ def paper(
         list[str] | None, typer.Option(help="result files of any row's system, NAME=DIR; one table; repeatable")
     ] = None,
     rehearse: Annotated[
-        bool, typer.Option("--rehearse", help="weights filled by rule for all networks: do all steps run here?")
+        bool,
+        typer.Option(
+            "--rehearse", help="weights filled by rule, and simulated frames where no data is named: do all steps run?"
+        ),
     ] = False,
     device: Annotated[str, typer.Option(help="of the networks: cpu or cuda")] = "cpu",
     dry: Annotated[bool, typer.Option("--dry", help="run nothing: the numbers, and what would be needed")] = False,
@@ -50,11 +55,14 @@ def paper(
     lcf3d paper table-2 --kitti KITTI --results LoGoNet=DIR   fills the row of a quoted system
 
     lcf3d paper splits --out KITTI/ImageSets                  train.txt and val.txt of the usual split
+
+    lcf3d paper --rehearse --out rehearsal                    all of it on simulated frames, without any download
     """
     from lcf3d.files import write_text
     from lcf3d.paper.networks import parse_uses
     from lcf3d.paper.tables import find_table, paper_tables
 
+    table = table or ("all" if rehearse else "list")
     if table == "list":
         return _print_list(json_)
     if table == "splits":
@@ -67,13 +75,24 @@ def paper(
     if len(tables) > 1 and (row or results):
         raise ConfigError("--row and --results are for one table; name it")
     uses = parse_uses(tuple(use or ()))
+    roots = {k: v.expanduser() for k, v in (("kitti", kitti), ("nuscenes", nuscenes)) if v is not None}
     if rehearse:
         from lcf3d.paper.rehearsal import filled_weights
 
         names = {name for one in tables for r in _chosen(one, row) for name in r.networks}
         uses = {**filled_weights(sorted(names - set(uses)), out / "rehearsal"), **uses}
-    roots = {k: v.expanduser() for k, v in (("kitti", kitti), ("nuscenes", nuscenes)) if v is not None}
+        roots = {**_simulated({kind for one in tables for kind in one.data} - set(roots), out / "rehearsal"), **roots}
     return _measure(tables, row, results, roots, uses, out, device, dry, overwrite, json_)
+
+
+def _simulated(kinds: set[str], folder: Path) -> dict[str, Path]:
+    """Folders of simulated frames by kind of dataset; what is there is taken."""
+    from lcf3d.paper.rehearsal import DATA
+    from lcf3d.simulation.writer import Recipe, write_dataset
+
+    for kind in sorted(kinds):
+        write_dataset(Recipe(*DATA[kind]), folder / kind, resume=True)
+    return {kind: folder / kind for kind in sorted(kinds)}
 
 
 def _measure(
@@ -154,7 +173,11 @@ def _measured(table: Table, rows: tuple[Row, ...], place: Workplace) -> dict[str
     if table.measure == "cost":
         from lcf3d.paper.cost import cost_rows, measure_costs
 
-        return cost_rows(table, rows, measure_costs(_fusion_ms, place.device), place.device)
+        try:
+            costs = measure_costs(_fusion_ms, place.uses, place.device)
+        except NeedsError as error:
+            return {row.name: without_values(table, f"needs {error}") for row in rows}
+        return cost_rows(table, rows, costs, place.uses, place.device)
     measured = {}
     for row in rows:
         try:

@@ -21,7 +21,7 @@ from lcf3d.fusion.decisions import (
     assemble,
     choose_representatives,
     decide_clusters,
-    replace_unconfirmed,
+    settle_doubles,
 )
 from lcf3d.fusion.localizer import Localizer
 from lcf3d.fusion.matching import Matches, View, boxes_after, confirmed_elsewhere, match_view, merge_views
@@ -91,7 +91,7 @@ class LateCascadeFusion:
         clusters, views, matches = self._match(branches)  # (c) bounding box matching
         decisions = self._decide(branches, clusters, views, matches)  # (e) semantic fusion
         recovery, notes = self._recover(frame, branches, clusters, views, matches, decisions)  # (d) detection recovery
-        decisions = replace_unconfirmed(decisions, branches.lidar, recovery, self.config.duplicate_iou)
+        decisions, recovery = settle_doubles(decisions, branches.lidar, recovery, self.config.duplicate_iou)
         given = tuple(camera[view.name] for view in branches.cameras)
         return assemble(branches, clusters, views, matches, decisions, recovery, notes, lidar, given)
 

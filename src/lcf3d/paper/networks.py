@@ -14,6 +14,7 @@ GROUPS = {"lidar": "lcf3d.lidar_detectors", "camera": "lcf3d.camera_detectors", 
 
 # LiDAR kinds that know the setting nms; alone, a network is measured after its own suppression
 _TORCH = KINDS
+_TORCH_CAMERAS = ("fasterrcnn", "ddq", "detectors", "mmdet")
 _SUPPRESSES = (*_TORCH, "shipped", "onnx-lidar")
 
 
@@ -89,7 +90,7 @@ def branches(row: Row, uses: Mapping[str, str], device: str = "cpu") -> tuple[st
             absent.append(str(error))
     if absent:
         raise NeedsError("; ".join(absent))
-    lidar, camera, localizer = (_with_device(spec, device) for spec in found)
+    lidar, camera, localizer = (with_device(spec, device) for spec in found)
     if not row.camera and plugins.parse(lidar).kind in _SUPPRESSES:
         lidar = _with(lidar, "nms=keep")
     return lidar, camera, localizer or "geometric"
@@ -99,8 +100,9 @@ def _with(spec: str, setting: str) -> str:
     return f"{spec}{'&' if '?' in spec else '?'}{setting}"
 
 
-def _with_device(spec: str, device: str) -> str:
-    by_torch = spec.partition(":")[0] in (*_TORCH, "fasterrcnn", "frustum-pointnet")
+def with_device(spec: str, device: str) -> str:
+    """What a command would name a network with, run on a torch device where torch runs it."""
+    by_torch = spec.partition(":")[0] in (*_TORCH, *_TORCH_CAMERAS, "frustum-pointnet")
     return _with(spec, f"device={device}") if by_torch and device != "cpu" else spec
 
 

@@ -11,6 +11,7 @@ from lcf3d.evaluation.domain_shift import IOU_THRESHOLDS
 from lcf3d.evaluation.domain_tasks import FUSED, LIDAR_ALONE, DomainTask, DomainTaskRunner
 from lcf3d.files import read_json, write_json
 from lcf3d.fusion.config import FusionConfig
+from lcf3d.paper.kept import Kept
 from lcf3d.paper.networks import branches, substitutes
 from lcf3d.paper.tables import Row, Table
 from lcf3d.paper.workplace import Measured, Workplace, root_of, run_name
@@ -28,7 +29,11 @@ def measure_shift(table: Table, row: Row, place: Workplace) -> Measured:
     trained, tested = row.task or ("", "")
     root = root_of(tested, place)
     split = "val" if (root / "ImageSets" / "val.txt").is_file() else None
-    task = DomainTask(trained, tested, f"{tested}:{root}", lidar, camera or None, split=split)
+    # a network's scores are probabilities; those of files may be anything
+    calibration = "auto" if lidar.startswith("results:") else "none"
+    task = DomainTask(
+        trained, tested, f"{tested}:{root}", lidar, camera or None, split=split, calibration=calibration
+    )
     kept = place.out / "runs" / f"shift+{trained}+{tested}+{run_name(table, row)}.json"
     inputs = asdict(task)
     content: dict[str, Any] = {} if place.overwrite or not kept.is_file() else read_json(kept)
@@ -45,6 +50,11 @@ def measure_shift(table: Table, row: Row, place: Workplace) -> Measured:
 
 def _measure(task: DomainTask, row: Row, place: Workplace) -> dict[str, Any]:
     runner = DomainTaskRunner(task, FusionConfig.preset("paper"))
+    kept, folder = Kept(), place.out / "detections"
+    runner.lidar = kept.lidar(runner.lidar, folder, f"{task.lidar} of {task.trained}", task.dataset)
+    if runner.camera is not None and task.camera is not None:
+        # a run on nuScenes keeps those of the same network in ten classes
+        runner.camera = kept.camera(runner.camera, folder, f"{task.camera} in KITTI's classes", task.dataset)
     advance = place.begin(row.name, len(runner))
     found = runner(advance=advance)[FUSED if row.camera else LIDAR_ALONE]
     figures = dict(zip(COLUMNS, map(float, table_values(found)), strict=True))
