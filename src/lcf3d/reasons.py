@@ -1,4 +1,7 @@
-"""What became of an input or output of the fusion, and why: codes and their words."""
+"""What became of an input or output of the fusion, and why: codes and their words.
+
+Beside arrays stands the plain number, ``Outcome.KEPT.value``: numpy takes five times as long for the member itself.
+"""
 
 from __future__ import annotations
 
