@@ -40,8 +40,7 @@ def find_alignment(
     Raises:
         DatasetError: no camera has detections in any of the frames looked at.
     """
-    most = FRAMES_WITH_IMAGES if any(isinstance(source, CameraOnImages) for source in cameras.values()) else FRAMES
-    step = -(-len(frame_ids) // most) or 1
+    step = _step(frame_ids, cameras)
     seen: dict[str, list[Sighting]] = {}
     for i, frame in enumerate(map(dataset.frame, frame_ids[::step])):
         views = [c for c in frame.cameras if c.name in cameras and cameras[c.name].sees(frame, c.name)]
@@ -56,6 +55,16 @@ def find_alignment(
             f"no frame has detections of {' or '.join(cameras)}: nothing to compare with the LiDAR boxes"
         )
     return {name: _reports(sightings) for name, sightings in seen.items()}
+
+
+def looked_at(frame_ids: Sequence[str], cameras: Mapping[str, CameraSource]) -> Sequence[str]:
+    """The frames that `find_alignment` looks at."""
+    return frame_ids[:: _step(frame_ids, cameras)]
+
+
+def _step(frame_ids: Sequence[str], cameras: Mapping[str, CameraSource]) -> int:
+    most = FRAMES_WITH_IMAGES if any(isinstance(source, CameraOnImages) for source in cameras.values()) else FRAMES
+    return -(-len(frame_ids) // most) or 1
 
 
 def _reports(sightings: list[Sighting]) -> list[CameraReport]:

@@ -12,6 +12,7 @@ import platform
 from collections import Counter, deque
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -131,13 +132,29 @@ def fuse_frames(
         sequences: groups of frames that must not be taken apart, see `run_frames`.
 
     Raises:
-        ConfigError: both ``jobs`` and ``ray``.
+        Lcf3dError: see `require_processes`.
     """
+    require_processes(run.request, jobs, ray)
     if ray is None:
         return run_frames(run.runner, frame_ids, jobs, sequences)
+    return run_on_ray(run, frame_ids, ray)
+
+
+def require_processes(request: RunRequest, jobs: int, ray: str | None) -> None:
+    """Refuse a cluster that a run cannot use, before anything is read.
+
+    Raises:
+        ConfigError: ``jobs`` beside ``ray``, or a run that remembers earlier frames.
+        MissingExtraError: Ray is not installed.
+    """
+    if ray is None:
+        return
     if jobs > 1:
         raise ConfigError("--ray has a worker for each processor or GPU of its cluster; leave --jobs out")
-    return run_on_ray(run, frame_ids, ray)
+    if request.memory or request.smooth:
+        raise ConfigError("--ray takes drives apart, and --memory and --smooth need them whole; leave one out")
+    if find_spec("ray") is None:
+        raise MissingExtraError("ray", "fleet", "--ray")
 
 
 def run_on_ray(run: Run, frame_ids: Sequence[str], address: str) -> Iterator[FrameSummary]:
@@ -149,12 +166,10 @@ def run_on_ray(run: Run, frame_ids: Sequence[str], address: str) -> Iterator[Fra
         address: of the cluster; ``auto`` for the one of this machine, started for the time being if there is none.
 
     Raises:
-        ConfigError: the cluster cannot be used, or the run remembers earlier frames.
+        ConfigError: the cluster cannot be used.
         MissingExtraError: Ray is not installed.
         Lcf3dError: an input is at fault, or a shard cost `ATTEMPTS` workers.
     """
-    if run.runner.memory is not None:
-        raise ConfigError("--ray takes drives apart, and --memory and --smooth need them whole; leave one out")
     shards = shards_of(run.folder, frame_ids, 16)
     if not shards:
         return
