@@ -119,7 +119,7 @@ def test_a_place_that_cannot_be_written_is_refused_first(
         prepare_run(nothing, full, overwrite=True)
     with pytest.raises(ConfigError, match="is a file; choose a folder"):
         prepare_run(nothing, full / "mine.txt")
-    with pytest.raises(ConfigError, match="mine.txt is read-only or no folder"):
+    with pytest.raises(ConfigError, match=r"mine\.txt is read-only or no folder"):
         prepare_run(nothing, full / "mine.txt" / "deeper")
     monkeypatch.setattr(os, "access", lambda path, mode: False)
     with pytest.raises(ConfigError, match="cannot be written"):
@@ -139,7 +139,7 @@ def test_packages_that_are_not_there_are_missed_first(monkeypatch: pytest.Monkey
         require_processes(nothing, 1, "auto")
     monkeypatch.setattr("lcf3d.formats.bag_files.find_spec", lambda name: None if name == "mcap" else name)
     require_writer("fused.bag")
-    with pytest.raises(MissingExtraError, match="writing fused.mcap needs mcap"):
+    with pytest.raises(MissingExtraError, match=r"writing fused\.mcap needs mcap"):
         require_writer("fused.mcap")
     command = ["run", "kitti:nowhere", "--lidar", "results:x", "--camera", "results:x", "--out", str(tmp_path / "out")]
     said = CliRunner().invoke(app, [*command, "--format", "mcap"])
