@@ -13,16 +13,18 @@ import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from lcf3d.datasets.base import ResultWriter
 from lcf3d.errors import ConfigError
 from lcf3d.files import atomic_path, inside, list_files, read_json, read_text, reading, remove_left_overs, write_json
 from lcf3d.frame import Frame
-from lcf3d.fusion.config import FusionConfig
 from lcf3d.processes import lock_folder, unlock_folder
 from lcf3d.provenance import FusedDetections
 from lcf3d.remote.places import remove
+
+if TYPE_CHECKING:
+    from lcf3d.fusion.config import FusionConfig
 
 FORMAT = 2
 """Of run folders; those of version 1 (lcf3d 0.1) are read, but not resumed."""
