@@ -53,6 +53,9 @@ def merge_shards(shards: Sequence[Path], out: Path) -> int:
     """
     if out.exists() and (not out.is_dir() or list_files(out)):
         raise ConfigError(f"{out} is not empty; choose another --out")
+    for folder in shards:
+        if not RunFolder.is_run(folder):
+            raise ConfigError(f"{folder} is no folder of 'lcf3d run': it has no run.json and provenance")
     requests = {folder: RunFolder(folder).request() for folder in shards}
     _require_whole(requests)
     request = {**next(iter(requests.values())), "shard": None, **_counts(list(requests.values()))}
