@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -73,8 +74,12 @@ def run(
     pending, sequences = pending_frames(prepared)
     counts = total(list(fuse_frames(prepared, pending, jobs, ray, sequences)))
     prepared.folder.finish(prepared.frame_ids)
+    warnings = prepared.warnings()
+    for sentence in warnings:
+        logging.getLogger(__name__).warning(sentence)
     return {
         **counts,
+        "warnings": list(warnings),
         "already_done": len(prepared.frame_ids) - len(pending),
         "out": str(out if is_url(out) else folder),
     }

@@ -10,6 +10,7 @@ from lcf3d import plugins
 from lcf3d.cli.app import app
 from lcf3d.errors import ConfigError
 from lcf3d.frame import Frame
+from lcf3d.fusion.alignment import realigned
 from lcf3d.fusion.calibration import Calibration
 from lcf3d.fusion.memory_config import ClassMemory
 from lcf3d.live.replay import frame_times, in_order
@@ -199,3 +200,25 @@ def test_times_of_a_replay_always_rise():
     assert frame_times([None, None, None], 10.0) == pytest.approx([0.0, 0.1, 0.2])
     # half a second, then another drive that begins earlier, then a gap of an hour
     assert frame_times([5.0, 5.5, 0.0, 3600.0], 10.0) == pytest.approx([0.0, 0.5, 1.7, 2.9])
+
+
+def test_a_run_says_loudly_that_a_camera_is_turned_and_how_to_mend_it(toy, tmp_path, monkeypatch, caplog):
+    from lcf3d import run
+    from tests.datasets import toy as module
+
+    straight, front = module.FRONT, realigned(module.FRONT, np.deg2rad([0, 1.0, 0]))
+    monkeypatch.setattr(module, "FRONT", front)
+    (warning,) = run(toy[0], toy[2], toy[4], tmp_path / "python", recovery="off")["warnings"]
+    assert "camera front looks turned" in warning
+    assert "yaw -1.0" in warning
+    assert "--self-calibrate" in warning
+    assert warning in caplog.text
+    command = ["run", *toy, "--recovery", "off", "--json"]
+    assert json.loads(lcf3d(*command, "--out", tmp_path / "turned"))["warnings"] == [warning]
+    # the same for tables of results
+    tables = json.loads(lcf3d(*command, "--out", tmp_path / "tables", "--format", "parquet"))
+    assert tables["warnings"] == [warning]
+    assert "looks turned" not in lcf3d(*command[:-1], "--out", tmp_path / "mended", "--self-calibrate")
+    assert f"warning: {warning}" in lcf3d(*command[:-1], "--out", tmp_path / "told")
+    monkeypatch.setattr(module, "FRONT", straight)
+    assert json.loads(lcf3d(*command, "--out", tmp_path / "straight"))["warnings"] == []

@@ -2,10 +2,11 @@ from __future__ import annotations
 
 import numpy as np
 import PIL.Image
+import PIL.ImageDraw
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lcf3d.visualization.canvas import Canvas, clip_segments
+from lcf3d.visualization.canvas import Canvas, clip_segments, font, plain, text_size
 
 RED = (255, 0, 0)
 coordinate = st.floats(-1e6, 1e6)
@@ -79,3 +80,22 @@ def test_text_is_drawn_and_the_background_kept() -> None:
     canvas.text(2, 2, "42", (255, 255, 255))
     assert np.asarray(canvas.image()).max() > 200
     assert np.asarray(background).max() == 0
+
+
+def test_a_text_looks_as_pillow_draws_it_and_stays_in_the_picture() -> None:
+    canvas = Canvas(black(80, 30))
+    canvas.text(10, 5, "car 0.93", (255, 255, 255), size=12)
+    expected = black(80, 30)
+    place = (10, 5 + text_size("car 0.93", 12)[1] / 2)
+    PIL.ImageDraw.Draw(expected).text(place, "car 0.93", fill=(255, 255, 255), font=font(12), anchor="lm")
+    difference = np.abs(np.asarray(canvas.image()).astype(int) - np.asarray(expected).astype(int))
+    assert difference.max() <= 1
+    assert np.asarray(expected).max() > 200
+    # one that begins outside is cut
+    outside = Canvas(black(20, 12))
+    outside.text(-30, -4, "pedestrian 0.99", RED, plate=True)
+    assert np.asarray(outside.image()).shape == (12, 20, 3)
+
+
+def test_pixels_of_one_colour() -> None:
+    assert (plain(3, 5, (1, 2, 3)) == [1, 2, 3]).all()

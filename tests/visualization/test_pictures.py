@@ -17,7 +17,7 @@ from lcf3d.geometry.camera import NEAR, project_boxes
 from lcf3d.provenance import FusedDetections
 from lcf3d.structures import Camera, Detections2D, Detections3D
 from lcf3d.visualization.bev import BevView, draw_bev
-from lcf3d.visualization.camera_view import draw_camera, projected_edges, scaled_camera
+from lcf3d.visualization.camera_view import draw_camera, projected_edges, resized, scaled_camera
 from lcf3d.visualization.canvas import clip_segments
 from lcf3d.visualization.png import draw_frame, save_png
 from lcf3d.visualization.scene import COLOURS, Scene
@@ -207,3 +207,24 @@ def test_edges_through_a_lens_bend_and_fit_its_bounds(camera: Camera) -> None:
     np.testing.assert_allclose(np.clip([*ends.min(axis=0), *ends.max(axis=0)], 0, limits), bounds[0], atol=1e-6)
     picture = draw_camera(None, lens, Scene(near, ("matched",), ("car",)), width=400)
     assert len(np.unique(np.asarray(picture).reshape(-1, 3), axis=0)) > 2
+
+
+def test_an_image_made_smaller_shows_the_mean_of_each_area() -> None:
+    image = np.random.default_rng(0).integers(0, 256, (60, 90, 3), dtype=np.uint8)
+    small = resized(image, 30, 20)
+    expected = image.reshape(20, 3, 30, 3, 3).mean(axis=(1, 3))
+    assert np.abs(small - expected).max() <= 1.5
+    # parts of pixels: by the share of each
+    wide = np.zeros((10, 25, 3), np.uint8)
+    wide[:, 12] = 200
+    assert resized(wide, 10, 4)[0, :, 0].tolist() == [0, 0, 0, 0, 40, 40, 0, 0, 0, 0]
+    for value in (0, 1, 128, 255):
+        flat = np.full((315, 777, 3), value, np.uint8)
+        assert (resized(flat, 171, 99) == value).all()
+    # hardly smaller, or larger, and never the same memory
+    assert resized(image, 80, 55).shape == (55, 80, 3)
+    assert resized(image, 180, 120).shape == (120, 180, 3)
+    assert not np.shares_memory(resized(image, 90, 60), image)
+    # of any layout
+    turned = np.ascontiguousarray(image.transpose(1, 0, 2)).transpose(1, 0, 2)
+    assert np.array_equal(resized(turned, 30, 20), small)

@@ -133,6 +133,7 @@ def run(
     counts = {
         **total(summaries),
         "left_out": list(prepared.notes),
+        "warnings": list(prepared.warnings()),
         "already_done": len(prepared.frame_ids) - len(pending),
         "out": url_of(out) or str(out),
     }
@@ -217,4 +218,6 @@ def _print(counts: dict[str, Any]) -> None:
         out.print(f"in {count} frames: {note}", soft_wrap=True)
     if counts["median_ms"]:
         out.print("median ms a frame: " + ", ".join(f"{k} {v:.1f}" for k, v in counts["median_ms"].items()))
+    for warning in counts["warnings"]:
+        out.print(f"warning: {warning}", soft_wrap=True)
     out.print(f"results in {counts['out']}", soft_wrap=True)

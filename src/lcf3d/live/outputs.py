@@ -9,7 +9,10 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from lcf3d.errors import ConfigError
 from lcf3d.frame import Frame
@@ -19,9 +22,6 @@ from lcf3d.live.settings import LiveResult
 from lcf3d.live.workers import Worker
 from lcf3d.provenance import FusedDetections
 from lcf3d.visualization.trails import Trails
-
-if TYPE_CHECKING:
-    import PIL.Image
 
 # seconds of the stream between two lines of health
 HEALTH_PERIOD = 1.0
@@ -162,8 +162,8 @@ def draw_result(result: LiveResult, folder: Path, trails: Trails) -> None:
     save_png(_picture(result.frame, result.fused, trails), folder / f"{result.time:010.3f}.png")
 
 
-def _picture(frame: Frame, fused: FusedDetections, trails: Trails) -> PIL.Image.Image:
-    from lcf3d.visualization.png import draw_frame
+def _picture(frame: Frame, fused: FusedDetections, trails: Trails) -> NDArray[np.uint8]:
+    from lcf3d.visualization.png import frame_pixels
     from lcf3d.visualization.scene import Scene
 
-    return draw_frame(frame, Scene.from_fused(fused, trails=trails(frame, fused)))
+    return frame_pixels(frame, Scene.from_fused(fused, trails=trails(frame, fused)))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
 
@@ -13,10 +13,14 @@ from lcf3d.frame import Frame
 from lcf3d.fusion.alignment import Alignment, realigned
 from lcf3d.fusion.alignment_matching import Sighting
 from lcf3d.fusion.alignment_watch import CORRELATED, FEWEST_PAIRS, CameraReport, WatchSettings, estimate, judge
+from lcf3d.provenance import FusedDetections
 from lcf3d.run.sources import CameraOnImages
+from lcf3d.structures import Detections2D, Detections3D
 
 # frames that are looked at, evenly over the drive; the same where a camera detector has to be run on them
 FRAMES, FRAMES_WITH_IMAGES = 200, 40
+# frames of a finished run that are looked at again
+LOOKED_BACK = 50
 # with fewer frames than this in a half of the drive the halves are not compared
 HALF = 20
 
@@ -40,16 +44,13 @@ def find_alignment(
     Raises:
         DatasetError: no camera has detections in any of the frames looked at.
     """
-    step = _step(frame_ids, cameras)
-    seen: dict[str, list[Sighting]] = {}
-    for i, frame in enumerate(map(dataset.frame, frame_ids[::step])):
-        views = [c for c in frame.cameras if c.name in cameras and cameras[c.name].sees(frame, c.name)]
-        boxes = lidar.detect(frame).with_classes(class_names) if views else None
-        for view in views:
-            assert boxes is not None
-            found = cameras[view.name].detect(frame, view.name).with_classes(class_names)
-            group = i if step >= CORRELATED else i // CORRELATED
-            seen.setdefault(view.name, []).append(Sighting.of(view, boxes, found, group=group))
+    chosen, step = _looked_at(frame_ids, cameras)
+
+    def detections(frame: Frame) -> tuple[Detections3D, dict[str, Detections2D]] | None:
+        names = [c.name for c in frame.cameras if c.name in cameras and cameras[c.name].sees(frame, c.name)]
+        return (lidar.detect(frame), {name: cameras[name].detect(frame, name) for name in names}) if names else None
+
+    seen = _sightings(map(dataset.frame, chosen), step, detections, class_names)
     if not seen:
         raise DatasetError(
             f"no frame has detections of {' or '.join(cameras)}: nothing to compare with the LiDAR boxes"
@@ -59,12 +60,69 @@ def find_alignment(
 
 def looked_at(frame_ids: Sequence[str], cameras: Mapping[str, CameraSource]) -> Sequence[str]:
     """The frames that `find_alignment` looks at."""
-    return frame_ids[:: _step(frame_ids, cameras)]
+    return _looked_at(frame_ids, cameras)[0]
 
 
-def _step(frame_ids: Sequence[str], cameras: Mapping[str, CameraSource]) -> int:
+def _looked_at(frame_ids: Sequence[str], cameras: Mapping[str, CameraSource]) -> tuple[Sequence[str], int]:
     most = FRAMES_WITH_IMAGES if any(isinstance(source, CameraOnImages) for source in cameras.values()) else FRAMES
-    return -(-len(frame_ids) // most) or 1
+    return _evenly(frame_ids, most)
+
+
+def turned_warnings(
+    dataset: Dataset, frame_ids: Sequence[str], read: Callable[[str], FusedDetections], class_names: Sequence[str]
+) -> tuple[str, ...]:
+    """A sentence for each camera that the results of a run show to be turned against its calibration.
+
+    For a run that did not look before: some of its frames are read again, nothing is detected anew.
+
+    Args:
+        dataset: whose frames they are.
+        frame_ids: the frames of the run.
+        read: gives the result of a frame.
+        class_names: classes that both branches detect.
+    """
+    chosen, step = _evenly(frame_ids, LOOKED_BACK)
+
+    def detections(frame: Frame) -> tuple[Detections3D, dict[str, Detections2D]]:
+        fused = read(frame.id)
+        return fused.lidar_inputs, dict(zip(fused.camera_names, fused.camera_inputs, strict=True))
+
+    warnings = []
+    for name, sightings in _sightings(map(dataset.frame, chosen), step, detections, class_names).items():
+        report = _reports(sightings)[0]
+        if report.status in ("drifting", "wrong"):
+            warnings.append(
+                f"camera {name} looks turned against its calibration ({describe(report)}): it confirms and recovers "
+                "boxes in the wrong places; run again with --self-calibrate --overwrite, or mend the calibration"
+            )
+    return tuple(warnings)
+
+
+def _evenly(frame_ids: Sequence[str], most: int) -> tuple[Sequence[str], int]:
+    """At most so many frames, evenly, and the step from one to the next."""
+    step = -(-len(frame_ids) // most) or 1
+    return frame_ids[::step], step
+
+
+def _sightings(
+    frames: Iterable[Frame],
+    step: int,
+    detections: Callable[[Frame], tuple[Detections3D, Mapping[str, Detections2D]] | None],
+    class_names: Sequence[str],
+) -> dict[str, list[Sighting]]:
+    """What each camera and the LiDAR saw in frames that are ``step`` apart."""
+    seen: dict[str, list[Sighting]] = {}
+    for i, frame in enumerate(frames):
+        given = detections(frame)
+        if given is None:
+            continue
+        boxes = given[0].with_classes(class_names)
+        group = i if step >= CORRELATED else i // CORRELATED
+        for view in frame.cameras:
+            if view.name in given[1]:
+                found = given[1][view.name].with_classes(class_names)
+                seen.setdefault(view.name, []).append(Sighting.of(view, boxes, found, group=group))
+    return seen
 
 
 def _reports(sightings: list[Sighting]) -> list[CameraReport]:

@@ -20,7 +20,7 @@ from lcf3d.fusion.pipeline import LateCascadeFusion
 from lcf3d.fusion.stereo import StereoConfig, StereoLateCascadeFusion
 from lcf3d.localizers.named import load_localizer
 from lcf3d.processes import LOCK
-from lcf3d.run.alignment import describe, find_alignment, looked_at
+from lcf3d.run.alignment import describe, find_alignment, looked_at, turned_warnings
 from lcf3d.run.folder import RunFolder
 from lcf3d.run.frames import FrameRunner
 from lcf3d.run.joins import left_out_counts, left_out_notes, report_notes, score_notes
@@ -110,6 +110,13 @@ class Run:
     folder: RunFolder
     request: RunRequest
     notes: tuple[str, ...] = ()
+
+    def warnings(self) -> tuple[str, ...]:
+        """What the finished run shows to be wrong with its inputs: cameras that are turned."""
+        if self.request.self_calibrate:
+            return ()
+        done = [frame_id for frame_id in self.frame_ids if self.folder.is_done(frame_id)]
+        return turned_warnings(self.dataset, done, self.folder.read, self.config.class_names)
 
 
 def prepare_run(

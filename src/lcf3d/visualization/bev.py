@@ -14,7 +14,7 @@ from lcf3d.geometry.camera import pixel_rays
 from lcf3d.geometry.epipolar import camera_centre
 from lcf3d.kernels import kernel
 from lcf3d.structures import Camera, FloatArray
-from lcf3d.visualization.canvas import Canvas, Colour
+from lcf3d.visualization.canvas import Canvas, Colour, plain
 from lcf3d.visualization.scene import COLOURS, TRUTH_COLOUR, Scene
 
 _GROUND = (16, 18, 22)
@@ -89,6 +89,11 @@ def draw_bev(
     Returns:
         RGB picture.
     """
+    return bev_canvas(points, cameras, scene, view).image()
+
+
+def bev_canvas(points: NDArray[np.float32] | None, cameras: Sequence[Camera], scene: Scene, view: BevView) -> Canvas:
+    """What `draw_bev` draws on, all drawn."""
     canvas = Canvas(_point_picture(points, view))
     if points is None:
         canvas.text(6, 4, "no scan", _RING_TEXT)
@@ -113,7 +118,7 @@ def draw_bev(
         shown = around[0] >= 0 and around[2] <= view.width and around[1] >= 0 and around[3] <= view.height
         if text and shown:
             canvas.label(around, text, COLOURS[scene.outcomes[i]], size=11, filled=False)
-    return canvas.image()
+    return canvas
 
 
 def _draw_trail(canvas: Canvas, way: FloatArray, colour: Colour) -> None:
@@ -123,14 +128,15 @@ def _draw_trail(canvas: Canvas, way: FloatArray, colour: Colour) -> None:
         canvas.lines(np.concatenate([way[k - 1], way[k]])[None], colour, width=1.6, opacity=opacity)
 
 
-def _point_picture(points: NDArray[np.float32] | None, view: BevView) -> PIL.Image.Image:
+def _point_picture(points: NDArray[np.float32] | None, view: BevView) -> NDArray[np.uint8]:
     """Points as dots, brighter with height; the highest point of a pixel shows."""
     levels = np.zeros((view.height, view.width), np.uint8)
+    picture = plain(view.height, view.width, _GROUND)
     if points is not None and len(points):
         _highest(np.asarray(points)[:, :3], view.pixels_per_metre, *view.origin, *_HEIGHTS, levels)
-    shades = _LOW + np.linspace(0, 1, 255)[:, None] * (_HIGH - _LOW)
-    table = np.concatenate([[_GROUND], shades]).astype(np.uint8)
-    return PIL.Image.fromarray(table.take(levels, axis=0))
+        shades = _LOW + np.linspace(0, 1, 255)[:, None] * (_HIGH - _LOW)
+        _paint(levels, shades.astype(np.uint8), picture)
+    return picture
 
 
 @kernel
@@ -143,6 +149,16 @@ def _highest(points, scale, column, row, low, high, levels):  # type: ignore[no-
             # a height that is no number counts as none
             if level > levels[int(y), int(x)]:
                 levels[int(y), int(x)] = np.uint8(level)
+
+
+@kernel
+def _paint(levels, shades, picture):  # type: ignore[no-untyped-def]
+    """Pixels of a level above 0 in the colour of that level."""
+    for row in range(levels.shape[0]):
+        for column in range(levels.shape[1]):
+            if levels[row, column]:
+                for c in range(3):
+                    picture[row, column, c] = shades[levels[row, column] - 1, c]
 
 
 def _draw_rings(canvas: Canvas, view: BevView, reach: float) -> None:

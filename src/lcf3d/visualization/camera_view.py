@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 import PIL.Image
@@ -11,8 +12,9 @@ from numpy.typing import NDArray
 from lcf3d.geometry.boxes import EDGES, box_corners
 from lcf3d.geometry.camera import project_boxes, project_points
 from lcf3d.geometry.lens import NEAR, edges_through_lens, polygon_through_lens
-from lcf3d.structures import Camera, FloatArray
-from lcf3d.visualization.canvas import Canvas
+from lcf3d.kernels import kernel
+from lcf3d.structures import Camera, FloatArray, IntArray
+from lcf3d.visualization.canvas import Canvas, plain
 from lcf3d.visualization.scene import CAMERA_COLOUR, COLOURS, TRUTH_COLOUR, Scene
 
 # pixels: height of the least thing with a label, and width up to which a picture has smaller labels
@@ -79,25 +81,80 @@ def draw_camera(
     Returns:
         RGB picture.
     """
+    return camera_canvas(image, camera, scene, width, title).image()
+
+
+def camera_canvas(
+    image: NDArray[np.uint8] | None, camera: Camera, scene: Scene, width: int | None = None, title: str = ""
+) -> Canvas:
+    """What `draw_camera` draws on, all drawn."""
     scale = 1.0 if width is None else width / camera.width
     camera = scaled_camera(camera, scale)
     if image is None:
-        background = PIL.Image.new("RGB", (camera.width, camera.height), _NO_IMAGE)
-    else:
-        background = PIL.Image.fromarray(image)
-        if background.size != (camera.width, camera.height):
-            background = background.resize(
-                (camera.width, camera.height), PIL.Image.Resampling.LANCZOS, reducing_gap=1.01
-            )
-    canvas = Canvas(background)
-    if image is None:
+        background = plain(camera.height, camera.width, _NO_IMAGE)
         title = f"{camera.name}: no image"
+    else:
+        background = resized(image, camera.width, camera.height)
+    canvas = Canvas(background)
     if title:
         canvas.text(6, 4, title, (255, 255, 255), plate=True)
     _draw_truth(canvas, camera, scene)
     _draw_boxes(canvas, camera, scene)
     _draw_image_boxes(canvas, camera, scene, scale)
-    return canvas.image()
+    return canvas
+
+
+def resized(image: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8]:
+    """A new (height, width, 3) picture of an (H, W, 3) one; where it is made much smaller, by the mean of each area."""
+    if image.shape[:2] == (height, width):
+        return np.array(image)
+    if min(image.shape[1] / width, image.shape[0] / height) < 2:
+        picture = PIL.Image.fromarray(image).resize((width, height), PIL.Image.Resampling.LANCZOS)
+        return np.array(picture)
+    small = np.empty((height, width, 3), np.uint8)
+    rows = np.ascontiguousarray(image).reshape(image.shape[0], -1)
+    _average(rows, *_shares(image.shape[0], height), *_shares(image.shape[1], width), small)
+    return small
+
+
+@lru_cache(maxsize=32)
+def _shares(many: int, few: int) -> tuple[IntArray, NDArray[np.uint32]]:
+    """Of ``few`` equal parts of ``many`` pixels: where each begins, and (few, K) 1024ths of pixels from there on."""
+    size = many / few
+    edges = np.arange(few + 1) * size
+    most = int(np.ceil(size)) + 1
+    first = np.clip(np.floor(edges[:-1]).astype(np.int64), 0, many - most)
+    pixels = first[:, None] + np.arange(most)
+    within = np.minimum(pixels + 1, edges[1:, None]) - np.maximum(pixels, edges[:-1, None])
+    shares = np.round(np.maximum(within, 0) / size * 1024).astype(np.int64)
+    # together they are one
+    shares[np.arange(few), shares.argmax(axis=1)] += 1024 - shares.sum(axis=1)
+    return first, shares.astype(np.uint32)
+
+
+@kernel
+def _average(rows, top, row_shares, left, column_shares, small):  # type: ignore[no-untyped-def]
+    """The mean of each area of an image whose rows are ``r, g, b, r, ...``, in whole numbers of 1024 * 1024ths."""
+    sums = np.empty(rows.shape[1], np.uint32)
+    for row in range(small.shape[0]):
+        sums[:] = 0
+        for k in range(row_shares.shape[1]):
+            share, pixels = row_shares[row, k], rows[top[row] + k]
+            if share:
+                for n in range(len(sums)):
+                    sums[n] += share * pixels[n]
+        for column in range(small.shape[1]):
+            red, green, blue = np.uint32(1 << 15), np.uint32(1 << 15), np.uint32(1 << 15)
+            place = 3 * left[column]
+            for k in range(column_shares.shape[1]):
+                share = column_shares[column, k]
+                red += share * (sums[place] >> np.uint32(4))
+                green += share * (sums[place + 1] >> np.uint32(4))
+                blue += share * (sums[place + 2] >> np.uint32(4))
+                place += 3
+            small[row, column, 0] = np.uint8(red >> np.uint32(16))
+            small[row, column, 1] = np.uint8(green >> np.uint32(16))
+            small[row, column, 2] = np.uint8(blue >> np.uint32(16))
 
 
 def _draw_truth(canvas: Canvas, camera: Camera, scene: Scene) -> None:
@@ -113,8 +170,9 @@ def _draw_boxes(canvas: Canvas, camera: Camera, scene: Scene) -> None:
     extents, visible = project_boxes(scene.boxes, camera)
     edges = projected_edges(scene.boxes, camera)
     order = [i for i in scene.drawing_order if visible[i]]
+    fronts = box_corners(scene.boxes)[:, _FRONT]
     for i in order:
-        front = _front_face(box_corners(scene.boxes[i : i + 1])[0, _FRONT], camera)
+        front = _front_face(fronts[i], camera)
         if scene.outcomes[i] != "dropped" and len(front):
             canvas.polygon(front, COLOURS[scene.outcomes[i]], 0.16)
     for i in order:

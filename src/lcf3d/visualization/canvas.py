@@ -10,7 +10,9 @@ import numpy as np
 import PIL.Image
 import PIL.ImageDraw
 import PIL.ImageFont
+from numpy.typing import NDArray
 
+from lcf3d.kernels import kernel
 from lcf3d.structures import FloatArray
 from lcf3d.visualization.strokes import Strokes
 
@@ -22,12 +24,13 @@ _LABEL_PADDING = 2
 
 
 class _Label(NamedTuple):
-    """A text in its place ``x1, y1, x2, y2``, on a plate (RGBA) if it has one."""
+    """A text in its place ``x1, y1, x2, y2``, on a plate of a colour and so many 255ths of opacity."""
 
     place: tuple[int, int, int, int]
     text: str
     ink: Colour
-    plate: tuple[int, int, int, int] | None
+    plate: Colour
+    opacity: int
     size: float
 
 
@@ -37,9 +40,27 @@ def font(size: float) -> PIL.ImageFont.FreeTypeFont | PIL.ImageFont.ImageFont:
     return PIL.ImageFont.load_default(size)
 
 
+# words come again and again; shaping and drawing one takes longer than all else about a label
+@lru_cache(maxsize=8192)
 def text_size(text: str, size: float) -> tuple[int, int]:
     """Width and line height of a text in pixels."""
     return int(np.ceil(font(size).getlength(text))), int(np.ceil(size * 1.25))
+
+
+@lru_cache(maxsize=8192)
+def text_mask(text: str, size: float, width: int, height: int) -> NDArray[np.uint8]:
+    """(height, width) how much of each pixel a text covers, 255 for all of it; centred between top and bottom."""
+    picture = PIL.Image.new("L", (width, height))
+    place = (_LABEL_PADDING, height / 2)
+    PIL.ImageDraw.Draw(picture).text(place, text, fill=255, font=font(size), anchor="lm")
+    return np.array(picture)
+
+
+def plain(height: int, width: int, colour: Sequence[int]) -> NDArray[np.uint8]:
+    """(height, width, 3) pixels of one colour; row by row, as three values at a time take ten times as long."""
+    rows = np.empty((height, 3 * width), np.uint8)
+    rows[:] = np.tile(np.array(colour, np.uint8), width)
+    return rows.reshape(height, width, 3)
 
 
 class Canvas:
@@ -48,13 +69,17 @@ class Canvas:
     Lines go into the picture at once, text on top of all when it is finished.
 
     Args:
-        background: RGB picture, left as it is.
+        background: RGB picture, left as it is; or its (H, W, 3) uint8 pixels, which are drawn into.
     """
 
-    def __init__(self, background: PIL.Image.Image) -> None:
-        self.width, self.height = background.size
-        self._strokes = Strokes(np.array(background.convert("RGB")))
+    def __init__(self, background: PIL.Image.Image | NDArray[np.uint8]) -> None:
+        if isinstance(background, PIL.Image.Image):
+            background = np.array(background.convert("RGB"))
+        self.height, self.width = background.shape[:2]
+        self._strokes = Strokes(background)
         self._labels: list[_Label] = []
+        # places of the labels, so many of them
+        self._taken = np.empty((16, 4), np.int64)
 
     def lines(
         self,
@@ -105,7 +130,7 @@ class Canvas:
         width, height = text_size(text, size)
         width, height = width + 2 * _LABEL_PADDING, height + _LABEL_PADDING
         x1, y1, x2, y2 = around
-        for x, y in (
+        corners = [
             (x1, y1 - height),
             (x2 - width, y1 - height),
             (x1, y2),
@@ -113,36 +138,80 @@ class Canvas:
             (x2, y1),
             (x1 - width, y1),
             (x1, y1),
-        ):
-            place = (round(x), round(y), round(x) + width, round(y) + height)
-            inside = place[0] >= 0 and place[1] >= 0 and place[2] <= self.width and place[3] <= self.height
-            if inside and not any(_overlap(place, other.place) for other in self._labels):
-                ink, plate = (_HALO, (*colour, 235)) if filled else (colour, (*_HALO, 150))
-                self._labels.append(_Label(place, text, ink, plate, size))
-                return True
-        return False
+        ]
+        # beyond any picture, where no whole number could hold it
+        far = 1e6
+        tried = np.clip(np.rint(corners), -far, far).astype(np.int64)
+        free = _first_free(tried, width, height, self.width, self.height, self._taken, len(self._labels))
+        if free < 0:
+            return False
+        x, y = tried[free].tolist()
+        ink, plate, opacity = (_HALO, colour, 235) if filled else (colour, _HALO, 150)
+        self._put(_Label((x, y, x + width, y + height), text, ink, plate, opacity, size))
+        return True
 
     def text(self, x: float, y: float, text: str, colour: Colour, size: float = 12.0, plate: bool = False) -> None:
         """Text with its top left corner at a place, on a dark ``plate`` or none; later labels keep away from it."""
         width, height = text_size(text, size)
         place = (round(x) - _LABEL_PADDING, round(y), round(x) + width + _LABEL_PADDING, round(y) + height)
-        self._labels.append(_Label(place, text, colour, (*_HALO, 150) if plate else None, size))
+        self._put(_Label(place, text, colour, _HALO, 150 if plate else 0, size))
+
+    def _put(self, label: _Label) -> None:
+        if len(self._labels) == len(self._taken):
+            self._taken = np.concatenate([self._taken, self._taken])
+        self._taken[len(self._labels)] = label.place
+        self._labels.append(label)
+
+    def pixels(self) -> NDArray[np.uint8]:
+        """(H, W, 3) the finished picture."""
+        pixels = self._strokes.pixels
+        for label in self._labels:
+            x1, y1, x2, y2 = label.place
+            _stamp(
+                pixels,
+                x1,
+                y1,
+                text_mask(label.text, label.size, x2 - x1, y2 - y1),
+                label.plate,
+                label.opacity,
+                label.ink,
+            )
+        self._labels.clear()
+        return pixels
 
     def image(self) -> PIL.Image.Image:
         """The finished RGB picture."""
-        pixels = self._strokes.pixels
-        for label in self._labels:
-            if label.plate is not None:
-                x1, y1, x2, y2 = np.maximum(label.place, 0)
-                *rgb, alpha = label.plate
-                under = pixels[y1:y2, x1:x2]
-                under[:] = (under * (1 - alpha / 255) + np.array(rgb) * (alpha / 255) + 0.5).astype(np.uint8)
-        picture = PIL.Image.fromarray(pixels)
-        draw = PIL.ImageDraw.Draw(picture)
-        for label in self._labels:
-            middle = (label.place[0] + _LABEL_PADDING, (label.place[1] + label.place[3]) / 2)
-            draw.text(middle, label.text, fill=label.ink, font=font(label.size), anchor="lm")
-        return picture
+        return PIL.Image.fromarray(self.pixels())
+
+
+@kernel
+def _first_free(corners, width, height, right, bottom, taken, count):  # type: ignore[no-untyped-def]
+    """The first of some upper left corners where a label is in the picture and over no other; -1 if there is none."""
+    for k in range(len(corners)):
+        x1, y1 = corners[k]
+        x2, y2 = x1 + width, y1 + height
+        free = x1 >= 0 and y1 >= 0 and x2 <= right and y2 <= bottom
+        for n in range(count):
+            if not free:
+                break
+            free = not (x1 < taken[n, 2] and taken[n, 0] < x2 and y1 < taken[n, 3] and taken[n, 1] < y2)
+        if free:
+            return k
+    return -1
+
+
+@kernel
+def _stamp(pixels, left, top, mask, plate, opacity, ink):  # type: ignore[no-untyped-def]
+    """Put a plate and a text over the pixels from a corner on, as far as they are in the picture."""
+    height, width = mask.shape
+    share = opacity / 255
+    for row in range(max(0, -top), min(height, pixels.shape[0] - top)):
+        for column in range(max(0, -left), min(width, pixels.shape[1] - left)):
+            cover = mask[row, column] / 255
+            for c in range(3):
+                under = pixels[top + row, left + column, c]
+                under = np.floor(under * (1 - share) + plate[c] * share + 0.5)
+                pixels[top + row, left + column, c] = np.uint8(under * (1 - cover) + ink[c] * cover + 0.5)
 
 
 def clip_segments(segments: FloatArray, bounds: tuple[float, float, float, float]) -> FloatArray:
@@ -180,7 +249,3 @@ def _dashes(segments: FloatArray, width: float) -> FloatArray:
         t = np.stack([starts, np.clip(starts + DASH - width, starts, length)], axis=1) / max(length, 1e-6)
         parts.append((segment[:2] + t[..., None] * delta).reshape(-1, 4))
     return np.concatenate(parts)
-
-
-def _overlap(a: tuple[int, int, int, int], b: tuple[int, int, int, int]) -> bool:
-    return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]

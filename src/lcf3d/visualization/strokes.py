@@ -7,10 +7,11 @@ from numpy.typing import NDArray
 
 from lcf3d.kernels import kernel
 from lcf3d.structures import FloatArray
+from lcf3d.visualization.scratch import scratch
 
 
 class Strokes:
-    """Draws into one picture; keeps the two buffers that all its strokes share.
+    """Draws into one picture.
 
     Args:
         pixels: (H, W, 3) uint8 RGB, changed in place.
@@ -18,8 +19,10 @@ class Strokes:
 
     def __init__(self, pixels: NDArray[np.uint8]) -> None:
         self.pixels = pixels
-        self._coverage = np.zeros(pixels.shape[:2], np.float32)
-        self._touched = np.empty(pixels.shape[0] * pixels.shape[1], np.int64)
+        size = pixels.shape[0] * pixels.shape[1]
+        # zero again after each stroke
+        self._coverage = scratch("coverage", size, np.float32, zeros=True).reshape(pixels.shape[:2])
+        self._touched = scratch("touched", size, np.int64)
 
     def lines(self, segments: FloatArray, colour: tuple[int, int, int], width: float, opacity: float) -> None:
         """Lines with round ends; where they cross each other they cover once.
@@ -70,7 +73,8 @@ def _cover(segments, half, coverage, touched):  # type: ignore[no-untyped-def]
                 y = b + 0.5
                 t = ((x - x1) * dx + (y - y1) * dy) / squared if squared > 0 else 0.0
                 t = min(max(t, 0.0), 1.0)
-                distance = np.hypot(x - x1 - t * dx, y - y1 - t * dy)
+                off_x, off_y = x - x1 - t * dx, y - y1 - t * dy
+                distance = np.sqrt(off_x * off_x + off_y * off_y)
                 share = min(min(1.0, 2 * half), reach - distance)
                 if share <= 0:
                     continue
