@@ -179,7 +179,9 @@ def test_recovered_double_of_a_confirmed_box():
     assert len(fused) == 1
 
 
-@pytest.mark.parametrize(("score", "reasons"), [(0.4, ("replaced", "localized")), (0.98, ("downweighted", "duplicate"))])
+@pytest.mark.parametrize(
+    ("score", "reasons"), [(0.4, ("replaced", "localized")), (0.98, ("downweighted", "duplicate"))]
+)
 def test_of_a_recovered_box_and_an_unconfirmed_one_on_one_spot_the_higher_score_stays(score, reasons):
     shifted = car(13.0, 2.3)  # too far off to match at 0.9, but on the same spot
     fused = fuse(

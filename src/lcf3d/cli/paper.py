@@ -76,6 +76,9 @@ def paper(
         raise ConfigError("--row and --results are for one table; name it")
     uses = parse_uses(tuple(use or ()))
     roots = {k: v.expanduser() for k, v in (("kitti", kitti), ("nuscenes", nuscenes)) if v is not None}
+    for kind, folder in roots.items():
+        if not folder.is_dir():
+            raise ConfigError(f"--{kind} {folder}: there is no such folder")
     if rehearse:
         from lcf3d.paper.rehearsal import filled_weights
 
@@ -166,6 +169,7 @@ def _given(table: Table, results: list[str] | None) -> dict[str, Path]:
 
 def _measured(table: Table, rows: tuple[Row, ...], place: Workplace) -> dict[str, Measured]:
     """All rows, those that cannot be measured with the reason."""
+    from lcf3d.paper.estimates import about
     from lcf3d.paper.measure import measure_row
     from lcf3d.paper.networks import NeedsError
     from lcf3d.paper.workplace import without_values
@@ -178,24 +182,37 @@ def _measured(table: Table, rows: tuple[Row, ...], place: Workplace) -> dict[str
         except NeedsError as error:
             return {row.name: without_values(table, f"needs {error}") for row in rows}
         return cost_rows(table, rows, costs, place.uses, place.device)
-    measured = {}
+    measured, absent = {}, []
     for row in rows:
         try:
             measured[row.name] = measure_row(table, row, place)
         except NeedsError as error:
-            measured[row.name] = without_values(table, f"needs {error}" if not row.quoted else str(error))
+            told = row.quoted or row.needs
+            measured[row.name] = without_values(table, *([told] if told else (f"needs {p}" for p in error.parts)))
+            absent += [row] if row.networks else []
         except ConfigError:
             raise
         except Lcf3dError as error:
             measured[row.name] = without_values(table, f"not measured: {error}")
+    for row in absent:
+        # what all of them take together, since a network runs once for all rows
+        measured[row.name] = without_values(table, *measured[row.name].notes, about(table, absent))
     return measured
 
 
 def _needs(table: Table, rows: tuple[Row, ...]) -> dict[str, Measured]:
     """What each row would need."""
+    from lcf3d.paper.estimates import DATA, about
     from lcf3d.paper.workplace import without_values
 
-    return {r.name: without_values(table, r.quoted or r.needs or f"needs {', '.join(r.networks)}") for r in rows}
+    found = {}
+    for row in rows:
+        kinds = ((row.task[1],) if row.task else table.data) if row.lidar else ()
+        data = (f"needs --{kind} FOLDER: {DATA[kind]}" for kind in kinds)
+        own = row.quoted or row.needs or f"needs {', '.join(row.networks) or 'no data'}"
+        takes = (about(table, rows) if table.data else "minutes",) if not row.quoted and not row.needs else ()
+        found[row.name] = without_values(table, own, *data, *takes)
+    return found
 
 
 def _fusion_ms() -> dict[str, float]:

@@ -81,7 +81,7 @@ def _require_frames(folder: Path, frame_ids: Sequence[str]) -> None:
         raise DatasetError(f"{folder} is not a folder; expected KITTI text files, one a frame")
     present = {path.stem for path in folder.glob("*.txt")}
     if not present and any(folder.rglob("*.parquet")):
-        raise DatasetError(f"{folder} holds parquet files; the server takes text, which 'lcf3d run --format folder' writes")
+        raise DatasetError(f"{folder} holds parquet files; the server takes text: run with --format folder")
     missing, others = sorted(set(frame_ids) - present), sorted(present - set(frame_ids))
     if missing:
         raise DatasetError(

@@ -89,7 +89,7 @@ def cost_rows(
     table: Table, rows: tuple[Row, ...], costs: list[Costs], uses: Mapping[str, str], device: str
 ) -> dict[str, Measured]:
     """Measured values of the table's rows by name; of rows that are not measured, what that would need."""
-    found = {row.name: without_values(table, f"needs {row.needs}") for row in rows if row.needs}
+    found = {row.name: without_values(table, row.needs) for row in rows if row.needs}
     for i, (row, values) in enumerate(zip(table.rows, costs, strict=False)):
         if row in rows:
             names = [NETWORKS[branch] for branch in _RUN.get(i, ())]

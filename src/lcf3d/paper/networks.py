@@ -19,7 +19,15 @@ _SUPPRESSES = (*_TORCH, "shipped", "onnx-lidar")
 
 
 class NeedsError(Lcf3dError):
-    """A row cannot be measured here; the message says what would have to be there."""
+    """A row cannot be measured here; the message says what would have to be there.
+
+    Attributes:
+        parts: each thing that would have to be there.
+    """
+
+    def __init__(self, *parts: str) -> None:
+        super().__init__("; ".join(parts))
+        self.parts = parts
 
 
 def parse_uses(items: tuple[str, ...]) -> dict[str, str]:
@@ -81,15 +89,16 @@ def branches(row: Row, uses: Mapping[str, str], device: str = "cpu") -> tuple[st
     Raises:
         NeedsError: a network's weights have no public address; all of those are named.
     """
-    found, absent = [], []
+    found: list[str] = []
+    absent: list[str] = []
     for branch in ("lidar", "camera", "localizer"):
         name = getattr(row, branch)
         try:
             found.append(spec_of(name, branch, uses) if name else "")
         except NeedsError as error:
-            absent.append(str(error))
+            absent += error.parts
     if absent:
-        raise NeedsError("; ".join(absent))
+        raise NeedsError(*absent)
     lidar, camera, localizer = (with_device(spec, device) for spec in found)
     if not row.camera and plugins.parse(lidar).kind in _SUPPRESSES:
         lidar = _with(lidar, "nms=keep")

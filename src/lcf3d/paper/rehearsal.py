@@ -10,13 +10,15 @@ from lcf3d.detectors.published import find_model
 from lcf3d.files import atomic_path
 from lcf3d.networks.torch import nn, torch
 
-# the camera networks are rehearsed as the smallest one that finds the same classes, on small images
+# the camera networks are rehearsed as the smallest one that finds the same classes, on small images: file, style, masks
 _CAMERAS = {
     "fasterrcnn-r101-kitti": ("fasterrcnn-kitti", "kitti", False),
     "fasterrcnn-r50-nuscenes": ("maskrcnn-nuscenes", "nuscenes", True),
     "ddq-detr-nuscenes": ("maskrcnn-nuscenes", "nuscenes", True),
     "detectors-nuimages": ("maskrcnn-nuscenes", "nuscenes", True),
 }
+# gain of the class weights, with which scores differ, and a threshold that a handful of boxes passes
+_SCORES = {"kitti": (150.0, 0.75), "nuscenes": (2.6, 0.4)}
 IMAGE_SIZE = "400x225"
 """Longer and shorter side of images that the camera networks see, in pixels."""
 
@@ -44,7 +46,9 @@ def _filled(name: str, path: Path) -> str:
             state = _state(name)
         with atomic_path(path) as temporary:
             torch.save({"state_dict": state}, temporary)
-    return str(path) if camera is None else f"fasterrcnn:{path}?size={IMAGE_SIZE}"
+    if camera is None:
+        return str(path)
+    return f"fasterrcnn:{path}?size={IMAGE_SIZE}&score_threshold={_SCORES[camera[1]][1]}"
 
 
 def _state(name: str) -> dict[str, Any]:
@@ -87,11 +91,11 @@ def _camera_state(style: str, masks: bool) -> dict[str, Any]:
 
     state: dict[str, Any] = FasterRCNNNetwork(50, STYLES[style], masks).state_dict()
     for parameter, value in state.items():
-        # residual blocks that add nothing keep activations finite; large class weights make scores differ
+        # residual blocks that add nothing keep activations finite
         if parameter.endswith("bn3.weight"):
             value.zero_()
         elif parameter.endswith("fc_cls.weight"):
-            value.mul_(150.0)
+            value.mul_(_SCORES[style][0])
     return state
 
 

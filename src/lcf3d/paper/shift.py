@@ -12,9 +12,9 @@ from lcf3d.evaluation.domain_tasks import FUSED, LIDAR_ALONE, DomainTask, Domain
 from lcf3d.files import read_json, write_json
 from lcf3d.fusion.config import FusionConfig
 from lcf3d.paper.kept import Kept
-from lcf3d.paper.networks import branches, substitutes
+from lcf3d.paper.networks import substitutes
 from lcf3d.paper.tables import Row, Table
-from lcf3d.paper.workplace import Measured, Workplace, root_of, run_name
+from lcf3d.paper.workplace import Measured, Workplace, needed, root_of, run_name
 
 
 def measure_shift(table: Table, row: Row, place: Workplace) -> Measured:
@@ -25,15 +25,13 @@ def measure_shift(table: Table, row: Row, place: Workplace) -> Measured:
         ConfigError: what is kept was measured with other inputs.
         Lcf3dError: data, weights or result files are wrong.
     """
-    lidar, camera, _ = branches(row, place.uses, place.device)
+    lidar, camera, _ = needed(table, row, place)
     trained, tested = row.task or ("", "")
     root = root_of(tested, place)
     split = "val" if (root / "ImageSets" / "val.txt").is_file() else None
     # a network's scores are probabilities; those of files may be anything
     calibration = "auto" if lidar.startswith("results:") else "none"
-    task = DomainTask(
-        trained, tested, f"{tested}:{root}", lidar, camera or None, split=split, calibration=calibration
-    )
+    task = DomainTask(trained, tested, f"{tested}:{root}", lidar, camera or None, split=split, calibration=calibration)
     kept = place.out / "runs" / f"shift+{trained}+{tested}+{run_name(table, row)}.json"
     inputs = asdict(task)
     content: dict[str, Any] = {} if place.overwrite or not kept.is_file() else read_json(kept)
