@@ -60,6 +60,33 @@ def test_a_recording_holds_scan_boxes_cameras_reasons_and_curves(tmp_path):
     assert [text for text in expected if text not in told] == []
 
 
+def test_names_with_spaces_and_slashes_are_names_and_not_paths(tmp_path, capfd):
+    frame, fused = fused_frame()
+    (view,) = frame.cameras
+    frame = frame.with_cameras([replace(view, name="front/left eye")])
+    log = RerunLog(tmp_path / "drive.rrd", ["front/left eye"], stream=True)
+    status = {"hardware_id": "camera front/left eye", "level": 0, "message": "ok", "values": []}
+    log.log(frame, replace(fused, camera_names=("front/left eye",)), latency_ms={"detect scan": 2.0}, health=[status])
+    log.close()
+    told = entities(tmp_path / "drive.rrd")
+    assert r"/world/cameras/front\/left\ eye/image" in told
+    assert r"/latency/detect\ scan" in told
+    assert r"/health/front\/left\ eye" in told
+    assert "Unescaped" not in capfd.readouterr().err
+
+
+def test_masks_colour_objects_and_leave_the_rest_alone(tmp_path):
+    log, logged = watched(tmp_path)
+    frame, fused = fused_frame()
+    log.log(frame, fused)
+    picture = logged["world/cameras/left/image/masks"][0].buffer.as_arrow_array().to_pylist()[0]
+    assert set(picture) == {0, 1}
+    log = RerunLog(tmp_path / "other.rrd", ["left"])
+    log.close()
+    told = entities(tmp_path / "other.rrd")
+    assert "AnnotationContext" in told
+
+
 def watched(tmp_path):
     """A log whose stream only keeps what is logged, by entity."""
     log, logged = RerunLog(tmp_path / "drive.rrd", ["left"], stream=True), {}

@@ -18,6 +18,10 @@ from lcf3d.visualization.scene import CAMERA_COLOUR, COLOURS, TRUTH_COLOUR, Scen
 from lcf3d.visualization.trails import Trails
 
 _GREY = (110, 115, 120)
+# colours are chosen for a dark ground, whatever the viewer's theme
+_GROUND = (16, 18, 22)
+# legible on the plates of a light theme and of a dark one
+_UNUSED = (150, 150, 150)
 # scans and images of more than this are thinned, so that a recording of a drive stays small
 MOST_POINTS = 60_000
 JPEG_QUALITY = 80
@@ -42,14 +46,24 @@ class RerunLog:
         except ImportError:
             raise MissingExtraError("rerun-sdk", "viz", "the Rerun viewer") from None
         self._rerun: Any = rerun
+        # names of cameras and stages may hold spaces and slashes
+        self._part: Any = rerun.escape_entity_path_part
         self._stream: Any = rerun.RecordingStream("lcf3d")
         if path is None:
             self._stream.spawn()
         else:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._stream.save(path)
-        self._stream.send_blueprint(_blueprint(rerun.blueprint, cameras, stream))
+        self._stream.send_blueprint(
+            _blueprint(rerun.blueprint, [(name, self._camera(name)) for name in cameras], stream)
+        )
         self._stream.log("world", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        # what is no object stays as it is
+        nothing = rerun.AnnotationContext([rerun.AnnotationInfo(0, "no object", (0, 0, 0, 0))])
+        self._stream.log("world", nothing, static=True)
+        for outcome, colour in COLOURS.items():
+            line = rerun.SeriesLines(colors=colour, names=outcome, widths=2)
+            self._stream.log(f"boxes/{outcome}", line, static=True)
         self._index = 0
         self._trails = Trails()
         self._messages: dict[str, str] = {}
@@ -103,6 +117,10 @@ class RerunLog:
         self._stream.flush()
         self._stream.disconnect()
 
+    def _camera(self, name: str) -> str:
+        """The entity of a camera."""
+        return f"world/cameras/{self._part(name)}"
+
     def _log_boxes(
         self, entity: str, boxes: FloatArray, colours: Sequence[tuple[int, int, int]], texts: Sequence[str]
     ) -> None:
@@ -128,7 +146,7 @@ class RerunLog:
         )
 
     def _log_camera(self, camera: Camera, frame: Frame, scene: Scene) -> None:
-        entity = f"world/cameras/{camera.name}"
+        entity = self._camera(camera.name)
         self._stream.log(
             entity,
             self._rerun.Transform3D(
@@ -146,7 +164,7 @@ class RerunLog:
             self._stream.log(f"{entity}/image", self._rerun.Image(pixels).compress(jpeg_quality=JPEG_QUALITY))
         found = scene.image_boxes.get(camera.name)
         if found is not None:
-            colours = [CAMERA_COLOUR if used else COLOURS["dropped"] for used in found.used]
+            colours = [CAMERA_COLOUR if used else _UNUSED for used in found.used]
             self._stream.log(
                 f"{entity}/image/boxes",
                 self._rerun.Boxes2D(
@@ -169,7 +187,7 @@ class RerunLog:
                     height, width = mask.bitmap.shape
                     part = picture[mask.y : mask.y + height, mask.x : mask.x + width]
                     part[mask.bitmap[: part.shape[0], : part.shape[1]]] = number % 255 + 1
-            self._stream.log(f"world/cameras/{name}/image/masks", self._rerun.SegmentationImage(picture, opacity=0.4))
+            self._stream.log(f"{self._camera(name)}/image/masks", self._rerun.SegmentationImage(picture, opacity=0.4))
 
     def _log_reasons(self, fused: FusedDetections, reasons: Sequence[str]) -> None:
         lines = [f"- {reason}" for reason in reasons] + [f"- *{note}*" for note in fused.notes]
@@ -183,8 +201,8 @@ class RerunLog:
         curves["scores/median"] = float(np.median(scores)) if len(scores) else 0.0
         # every outcome at every frame: a curve that stops would look as if it went on
         curves |= {f"boxes/{outcome}": float(scene.outcomes.count(outcome)) for outcome in COLOURS}
-        curves |= {f"latency/{part}": value for part, value in latency_ms.items()}
-        curves |= {f"alignment/{camera}": value for camera, value in alignment_deg.items()}
+        curves |= {f"latency/{self._part(part)}": value for part, value in latency_ms.items()}
+        curves |= {f"alignment/{self._part(camera)}": value for camera, value in alignment_deg.items()}
         for entity, value in curves.items():
             self._stream.log(entity, self._rerun.Scalars(value))
 
@@ -194,11 +212,11 @@ class RerunLog:
         levels = ("INFO", "WARN", "ERROR", "ERROR")
         for status in health:
             part = str(status["hardware_id"]).removeprefix("camera ")
-            self._stream.log(f"health/{part}", self._rerun.Scalars(float(status["level"])))
+            self._stream.log(f"health/{self._part(part)}", self._rerun.Scalars(float(status["level"])))
             values = {entry["key"]: entry["value"] for entry in status["values"]}
             share = float(values.get("confirmed_share", "nan"))
             if np.isfinite(share):
-                self._stream.log(f"confirmed/{part}", self._rerun.Scalars(share))
+                self._stream.log(f"confirmed/{self._part(part)}", self._rerun.Scalars(share))
             if self._messages.get(part) != status["message"]:
                 self._messages[part] = status["message"]
                 line = self._rerun.TextLog(f"{part}: {status['message']}", level=levels[status["level"]])
@@ -218,26 +236,25 @@ def point_colours(points: NDArray[np.float32], scene: Scene) -> NDArray[np.uint8
     return colours
 
 
-def _blueprint(blueprint: Any, cameras: Sequence[str], stream: bool) -> Any:
-    """Scan and boxes beside the reasons; cameras below; curves at the bottom, of a stream beside what happened."""
+def _blueprint(blueprint: Any, cameras: Sequence[tuple[str, str]], stream: bool) -> Any:
+    """Scan and boxes above the cameras (name, entity); beside them reasons, curves and, of a stream, events."""
     views = [
-        blueprint.Spatial2DView(origin=f"world/cameras/{name}/image", name=name, contents="$origin/**")
-        for name in cameras
+        blueprint.Spatial2DView(origin=f"{entity}/image", name=name, contents="$origin/**") for name, entity in cameras
     ]
-    names = ["scores", "boxes", *(["latency", "alignment", "health", "confirmed"] if stream else [])]
-    curves = [blueprint.TimeSeriesView(origin=name, name=name.capitalize()) for name in names]
-    reasons = blueprint.TextDocumentView(origin="reasons", name="Reasons")
-    beside = (
-        [blueprint.Vertical(reasons, blueprint.TextLogView(origin="events", name="Health"))] if stream else [reasons]
-    )
-    return blueprint.Blueprint(
-        blueprint.Vertical(
-            blueprint.Horizontal(
-                blueprint.Spatial3DView(origin="world", name="Scan and boxes"), *beside, column_shares=[3, 1]
-            ),
-            *([blueprint.Horizontal(*views)] if views else []),
-            blueprint.Horizontal(*curves),
-            row_shares=[4, *([2] if views else []), 1],
-        ),
-        collapse_panels=True,
-    )
+    legend = blueprint.PlotLegend(corner=blueprint.Corner2D.LeftTop)
+
+    def curves(*names: str) -> Any:
+        shown = [blueprint.TimeSeriesView(origin=n, name=n.capitalize(), plot_legend=legend) for n in names]
+        return blueprint.Tabs(*shown)
+
+    beside = [blueprint.TextDocumentView(origin="reasons", name="Reasons")]
+    if stream:
+        beside.append(blueprint.TextLogView(origin="events", name="Health"))
+        beside += [curves("latency", "health", "alignment"), curves("boxes", "scores", "confirmed")]
+    else:
+        beside += [curves("boxes"), curves("scores")]
+    scene = blueprint.Spatial3DView(origin="world", name="Scan and boxes", background=_GROUND)
+    cameras_below = [blueprint.Grid(*views, grid_columns=min(len(views), 3))] if views else []
+    left = blueprint.Vertical(scene, *cameras_below, row_shares=[3, *([2] if views else [])])
+    right = blueprint.Vertical(*beside, row_shares=[3, *([1] if stream else []), 2, 2])
+    return blueprint.Blueprint(blueprint.Horizontal(left, right, column_shares=[5, 3]), collapse_panels=True)
