@@ -92,8 +92,7 @@ def _objects(camera: Camera, further: float) -> FloatArray:
 
 def _surface(box: FloatArray) -> np.ndarray[tuple[int, int], np.dtype[np.float32]]:
     """Points on an object and on the ground about it."""
-    u, v = np.meshgrid(np.linspace(-0.5, 0.5, 20), np.linspace(-0.5, 0.5, 20))
-    u, v = u.ravel(), v.ravel()
+    u, v = (grid.ravel() for grid in np.meshgrid(np.linspace(-0.5, 0.5, 20), np.linspace(-0.5, 0.5, 20)))
     side = np.column_stack([u * box[3], np.full(len(u), box[4] / 2), v * box[5]])
     front = np.column_stack([np.full(len(u), -box[3] / 2), u * box[4], v * box[5]])
     ground = np.column_stack([u * 12, v * 12, np.full(len(u), -box[5] / 2)])

@@ -165,6 +165,8 @@ class TorchvisionFasterRCNN:
         ConfigError: unknown style, normalization or device, or a size that is none.
     """
 
+    style: Style
+
     def __init__(
         self,
         path: Path | str,
