@@ -10,6 +10,8 @@ from pathlib import Path
 import pytest
 
 import lcf3d
+from lcf3d.datasets import kitti_results
+from lcf3d.detectors.joins import LeftOut
 from lcf3d.errors import ConfigError, Lcf3dError, MissingExtraError
 from lcf3d.run import ray_workers
 from lcf3d.run.folder import RunFolder
@@ -161,6 +163,46 @@ def test_a_worker_without_a_cluster(root: Path, tmp_path: Path) -> None:
     prepared.folder.take(files)
     assert prepared.folder.frame_ids() == list(IDS[:3])
     prepared.folder.release()
+
+
+def test_a_worker_reads_the_files_of_its_shards_at_once(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    prepared = prepare_run(request(root), tmp_path / "out")
+    prepared.folder.release()
+    worker = ShardWorker(Plan.of(prepared))
+    read: list[tuple[str, ...]] = []
+    read_folder = kitti_results.read_folder
+
+    def noting(folder: Path, frame_ids, **options):
+        read.append(tuple(frame_ids))
+        return read_folder(folder, frame_ids, **options)
+
+    monkeypatch.setattr(kitti_results, "read_folder", noting)
+    # a part must not list the files of all others
+    list_it = os.scandir
+    monkeypatch.setattr(os, "scandir", lambda a=".": pytest.fail("listed") if root in Path(a).parents else list_it(a))
+    summaries, _ = worker.fuse(IDS[4:9])
+    assert len(summaries) == 5
+    assert read == [IDS[4:9], IDS[4:9]]
+
+
+def test_sources_that_add_up_what_others_count_go_to_a_worker_too(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Several:
+        """As a folder of results for each camera."""
+
+        @property
+        def left_out(self) -> LeftOut:
+            return LeftOut("somewhere", taken=3)
+
+    prepared = prepare_run(request(root), tmp_path / "out")
+    prepared.folder.release()
+    plan = Plan.of(prepared)
+    inputs = ray_workers.read_inputs(prepared.request, look=False)
+    monkeypatch.setattr(ray_workers, "read_inputs", lambda *a, **k: inputs._replace(cameras={"left": Several()}))
+    assert plan.runner(tmp_path / "worker").cameras["left"].left_out.taken == 3
 
 
 def test_memory_of_drives_and_ray_do_not_go_together(root: Path, tmp_path: Path) -> None:

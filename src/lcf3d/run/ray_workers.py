@@ -73,8 +73,9 @@ class Plan:
         """
         inputs = read_inputs(self.request, settings=self.config, look=False)
         for name, source in {"": inputs.lidar, **inputs.cameras}.items():
-            if self.left_out.get(name) is not None:
-                setattr(source, "left_out", self.left_out[name])  # noqa: B010 - not every source counts
+            # not every source counts, and some add up what others have counted
+            if self.left_out.get(name) is not None and "left_out" in vars(source):
+                setattr(source, "left_out", self.left_out[name])  # noqa: B010
         tables = self.request.form == "parquet"
         folder = TableRunFolder(out) if tables else RunFolder(out, inputs.dataset.writer(out))
         fusion = make_fusion(self.config, inputs.localizer, self.calibration, self.reports)
@@ -99,6 +100,10 @@ class ShardWorker:
         try:
             if self._runner is None:
                 self._runner = self._plan.runner(Path(self._folder.name))
+            for source in (self._runner.lidar, *self._runner.cameras.values()):
+                # all files of the shard at once
+                if getattr(source, "reads_frames", False):
+                    source.load(frame_ids)  # type: ignore[attr-defined]
             summaries = list(run_shard(self._runner, frame_ids))
             return summaries, _taken(Path(self._folder.name))
         except Lcf3dError as error:
