@@ -5,8 +5,9 @@
 
 The shipped networks are run once a frame: the LiDAR's without suppression on the scan as it is and on one in four of
 its beams, the camera's on both images. Rows: those of ``lcf3d ablate`` (left camera, ``--localizer``), stereo pairs
-beside one camera, and the localizers; 3D AP R40 (KITTI, moderate), mean centre-distance AP, and the gain over the LiDAR
-alone with 95 % bootstrap intervals over frames. A folder that is still being simulated is taken as far as it has come.
+beside one camera, and the localizers; 3D AP R40 (KITTI, moderate), mean centre-distance AP, and for the modules the
+gain over the LiDAR alone with 95 % bootstrap intervals over frames. A folder that is still being simulated is taken as
+far as it has come.
 
 What the networks find is kept in HELDOUT/detections-WEIGHTS, one file a frame, named after the weights: the tables can
 be made again, or in a process for each LiDAR (``--lidars``), without running them; ``--detect-only`` makes the files.
@@ -27,7 +28,7 @@ from lcf3d.datasets.drive import every_beam
 from lcf3d.datasets.kitti import KittiDataset
 from lcf3d.detectors.lidar.kinds import MODELS
 from lcf3d.detectors.named import load_detector
-from lcf3d.evaluation.ablation import Variant, suppressed, variants
+from lcf3d.evaluation.ablation import MODULES, Variant, suppressed, variants
 from lcf3d.evaluation.domain_shift import evaluate_shift, split_truth
 from lcf3d.evaluation.kitti_task import KittiEvaluation
 from lcf3d.evaluation.protocol import EvaluationOptions
@@ -43,6 +44,7 @@ from lcf3d.reasons import Outcome
 from lcf3d.structures import KITTI_CLASSES, Detections2D, Detections3D, InstanceMask
 
 LIDARS = {"64 beams": 1, "16 beams": 4}
+WITH_INTERVALS = (MODULES, "these settings")
 LOCALIZERS: dict[str, Callable[[], Any]] = {
     "geometric": GeometricLocalizer,
     "network": ShippedLocalizer,
@@ -176,7 +178,16 @@ def rows_of(
     chosen += [
         (Variant("localizer", name, {}), LateCascadeFusion(config, make()), left) for name, make in LOCALIZERS.items()
     ]
-    return [row_of(v, fusion, seen, frames, lidar, alone, evaluation, options.samples) for v, fusion, seen in chosen]
+    rows: list[dict[str, Any]] = []
+    made: dict[str, dict[str, Any]] = {}
+    for variant, fusion, seen in chosen:
+        # what the settings at hand are in one group is a row of many others
+        key = "alone" if fusion is None else f"{fusion.config} {type(fusion.localizer).__name__} {seen is left}"
+        if key not in made:
+            samples = options.samples if variant.group in WITH_INTERVALS else 0
+            made[key] = row_of(variant, fusion, seen, frames, lidar, alone, evaluation, samples)
+        rows.append({**made[key], "group": variant.group, "name": variant.name})
+    return rows
 
 
 def row_of(
@@ -199,7 +210,7 @@ def row_of(
             outcomes += np.bincount(fused.outcomes, minlength=len(Outcome))
     truths = [split_truth(frame.labels) for frame in frames if frame.labels is not None]
     shift = evaluate_shift(truths, results, [frame.camera("left") for frame in frames]).metrics
-    gain = evaluation.differences(alone, results, samples) if fusion is not None else {}
+    gain = evaluation.differences(alone, results, samples) if samples and fusion is not None else {}
     return {
         "group": variant.group,
         "name": variant.name,

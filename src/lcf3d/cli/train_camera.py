@@ -63,7 +63,7 @@ def camera(
     from lcf3d.detectors.camera.small import shipped_path
     from lcf3d.detectors.camera.small_network import SmallConfig
     from lcf3d.training.camera import CameraTask
-    from lcf3d.training.loop import TrainingSettings, import_torch, require_device
+    from lcf3d.training.loop import TrainingSettings, import_torch, require_device, require_unused
     from lcf3d.training.samples import SampleRecipe
 
     torch = import_torch()
@@ -71,6 +71,8 @@ def camera(
     if threads:
         torch.set_num_threads(threads)
     start, begin = beginning(init, shipped_path)
+    if not resume:
+        require_unused(out)
     recipe = SampleRecipe("camera", preset, frames, samples_seed, SAMPLE_SCALE, density)
     if dataset:
         if masks:

@@ -52,12 +52,16 @@ def beginning(init: str, shipped: Callable[[str], Path]) -> tuple[Path | None, P
         shipped: gives the file of a network that comes with lcf3d.
 
     Raises:
-        ConfigError: lcf3d ships no such network.
+        ConfigError: there is no such file, or lcf3d ships no such network.
         DetectorError: lcf3d ships no such network.
     """
     if init.startswith("shipped:"):
         return None, shipped(init.removeprefix("shipped:"))
     path = Path(init) if init else None
+    if path is not None and not path.is_file():
+        raise ConfigError(
+            f"--init {init} does not exist; name last.pt of a training, an exported .onnx file or shipped:kitti"
+        )
     return (None, path) if path is not None and path.suffix == ".onnx" else (path, None)
 
 

@@ -71,7 +71,7 @@ def lidar(
     from lcf3d.detectors.lidar.kinds import shipped_path
     from lcf3d.training.lidar import LidarTask, objects_of
     from lcf3d.training.lidar_augmentation import AugmentationSettings
-    from lcf3d.training.loop import TrainingSettings, import_torch, require_device
+    from lcf3d.training.loop import TrainingSettings, import_torch, require_device, require_unused
     from lcf3d.training.samples import SampleRecipe
 
     torch = import_torch()
@@ -81,6 +81,8 @@ def lidar(
     recipe = SampleRecipe("lidar", preset, frames, samples_seed, density=density)
     config, painter = _painting(paint, frustums, dataset)
     start, begin = beginning(init, shipped_path)
+    if not resume:
+        require_unused(out)
     scans = _scans(dataset, split, version, recipe, samples, jobs, painter)
     learned, measured = scans.hold_out(held_out_of(scans.count, held_out, 100))
     objects = objects_of(learned, config)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final
 
@@ -282,8 +281,8 @@ def _draw_labels(axes: Any, sides: Sequence[tuple[float, LabelStatistics, str, s
     axes[1, 1].set_xticklabels(names, fontsize=8)
     axes[1, 2].set(title="distance of labels (m)")
     axes[0, 3].set(title="labels of occlusion 0, 1, 2, 3 (share)")
-    classes = ", ".join(f"{a:g}-{b:g}" for a, b in pairwise(HEIGHT_EDGES))
-    axes[1, 3].set(title=f"labels {classes} pixels high (share)")
+    lowest = ", ".join(f"{edge:g}" for edge in HEIGHT_EDGES[:-1])
+    axes[1, 3].set(title=f"labels of {lowest} and more pixels (share)")
 
 
 def _draw_shares(axis: Any, shift: float, shares: Mapping[str, FloatArray], name: str, colour: str) -> None:
