@@ -23,7 +23,8 @@ def paper(
     kitti: Annotated[Path | None, typer.Option(help="folder of KITTI's object benchmark")] = None,
     nuscenes: Annotated[Path | None, typer.Option(help="folder of nuScenes")] = None,
     row: Annotated[
-        list[str] | None, typer.Option(help="only the row of which this is the name or its beginning; repeatable")
+        list[str] | None,
+        typer.Option(help="only rows of which this is the name or its beginning; repeatable"),
     ] = None,
     use: Annotated[
         list[str] | None,
@@ -60,7 +61,7 @@ def paper(
     """
     from lcf3d.files import write_text
     from lcf3d.paper.networks import parse_uses
-    from lcf3d.paper.tables import find_table, paper_tables
+    from lcf3d.paper.tables import find_rows, find_table, paper_tables
 
     table = table or ("all" if rehearse else "list")
     if table == "list":
@@ -71,21 +72,25 @@ def paper(
         for name, ids in (("train", KITTI_TRAIN), ("val", KITTI_VAL)):
             write_text(out / f"{name}.txt", "".join(f"{frame_id}\n" for frame_id in ids))
         return typer.echo(f"wrote {out / 'train.txt'} ({len(KITTI_TRAIN):,} frames) and val.txt ({len(KITTI_VAL):,})")
-    tables = list(paper_tables().values()) if table == "all" else [find_table(table)]
-    if len(tables) > 1 and (row or results):
-        raise ConfigError("--row and --results are for one table; name it")
+    chosen = find_rows(list(paper_tables().values()) if table == "all" else [find_table(table)], row or [])
+    if len(chosen) > 1 and results:
+        raise ConfigError("--results is for one table; name it")
     uses = parse_uses(tuple(use or ()))
     roots = {k: v.expanduser() for k, v in (("kitti", kitti), ("nuscenes", nuscenes)) if v is not None}
     for kind, folder in roots.items():
         if not folder.is_dir():
             raise ConfigError(f"--{kind} {folder}: there is no such folder")
     if rehearse:
+        from lcf3d.paper.cost import networks_of
         from lcf3d.paper.rehearsal import filled_weights
 
-        names = {name for one in tables for r in _chosen(one, row) for name in r.networks}
+        names = {name for one, rows in chosen for r in rows for name in networks_of(one, r)}
         uses = {**filled_weights(sorted(names - set(uses)), out / "rehearsal"), **uses}
-        roots = {**_simulated({kind for one in tables for kind in one.data} - set(roots), out / "rehearsal"), **roots}
-    return _measure(tables, row, results, roots, uses, out, device, dry, overwrite, json_)
+        roots = {
+            **_simulated({kind for one, _ in chosen for kind in one.data} - set(roots), out / "rehearsal"),
+            **roots,
+        }
+    return _measure(chosen, results, roots, uses, out, device, dry, overwrite, json_)
 
 
 def _simulated(kinds: set[str], folder: Path) -> dict[str, Path]:
@@ -99,8 +104,7 @@ def _simulated(kinds: set[str], folder: Path) -> dict[str, Path]:
 
 
 def _measure(
-    tables: list[Table],
-    names: list[str] | None,
+    chosen: list[tuple[Table, tuple[Row, ...]]],
     results: list[str] | None,
     roots: Mapping[str, Path],
     uses: Mapping[str, str],
@@ -128,9 +132,8 @@ def _measure(
             bar = progress.add_task(name, total=frames)
             return lambda: progress.advance(bar)
 
-        for one in tables:
+        for one, rows in chosen:
             place = Workplace(out, roots, uses, _given(one, results), device, overwrite, begin)
-            rows = _chosen(one, names)
             measured = _needs(one, rows) if dry else _measured(one, rows, place)
             contents.append(to_json(one, rows, measured))
             data = table_data(one, rows, measured)
@@ -142,12 +145,6 @@ def _measure(
                 print_table(data)
     if json_:
         typer.echo(json.dumps(contents if len(contents) > 1 else contents[0], indent=2))
-
-
-def _chosen(table: Table, names: list[str] | None) -> tuple[Row, ...]:
-    from lcf3d.paper.tables import find_row
-
-    return tuple(find_row(table, name) for name in names) if names else table.rows
 
 
 def _given(table: Table, results: list[str] | None) -> dict[str, Path]:
