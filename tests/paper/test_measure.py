@@ -165,6 +165,20 @@ def test_a_folder_without_a_list_has_to_hold_the_papers_frames(tmp_path, drive):
         measure_row(table, table.rows[3], place(tmp_path, (root, *drive[1:])))
 
 
+def test_mvxnet_looks_through_the_front_camera_of_the_other_dataset(tmp_path, monkeypatch):
+    from lcf3d.paper import shift
+
+    tasks = []
+    monkeypatch.setattr(shift, "_measure", lambda task, row, place: tasks.append(task) or {"figures": {}, "frames": 1})
+    here = Workplace(tmp_path, {"kitti": tmp_path, "nuscenes": tmp_path})
+    for name in ("kitti -> nuscenes: MVXNet", "kitti -> kitti: MVXNet"):
+        measure_row(find_table("table-7"), find_row(find_table("table-7"), name), here)
+    assert [task.lidar for task in tasks] == [
+        "mvxnet:mvxnet-kitti?nms=keep&camera=CAM_FRONT",
+        "mvxnet:mvxnet-kitti?nms=keep",
+    ]
+
+
 def test_the_split_lists_are_written(tmp_path):
     result = CliRunner().invoke(app, ["paper", "splits", "--out", str(tmp_path)])
     assert result.exit_code == 0, result.output

@@ -18,7 +18,7 @@ ROWS = {
     "table-4": ("matching + recovery + semantic fusion",),
     "table-5": ("RGB branch",),
     "table-6": ("Bbox + Mask",),
-    "table-7": ("kitti -> nuscenes: MVXNet", "nuscenes -> kitti: BEVFusion", "kitti -> nuscenes: LCF3D"),
+    "table-7": ("nuscenes -> kitti: BEVFusion", "kitti -> nuscenes: LCF3D"),
     "figure-1": ("LCF3D*",),
     "figure-2": ("kitti -> nuscenes: LCF3D",),
 }
