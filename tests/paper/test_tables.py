@@ -93,6 +93,9 @@ def test_a_file_or_another_detector_stands_for_a_network(tmp_path):
     assert branches(row, {"pointpillars-kitti": str(weights)}) == (f"pointpillars:{weights}?nms=keep", "", "geometric")
     assert branches(row, {}, "cuda")[0] == "pointpillars:pointpillars-kitti?device=cuda&nms=keep"
     assert branches(row, {"pointpillars-kitti": "results:DIR"})[0] == "results:DIR"
+    # no suppression of its own, so no setting for it
+    fusion = find_row(find_table("table-7"), "nuscenes -> kitti: BEVFusion")
+    assert branches(fusion, {})[0] == "bevfusion:bevfusion-nuscenes"
     with pytest.raises(ConfigError, match="no such file"):
         spec_of("pointpillars-kitti", "lidar", {"pointpillars-kitti": "gone.pth"})
     with pytest.raises(ConfigError, match="--use takes"):

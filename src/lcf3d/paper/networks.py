@@ -15,7 +15,7 @@ GROUPS = {"lidar": "lcf3d.lidar_detectors", "camera": "lcf3d.camera_detectors", 
 # LiDAR kinds that know the setting nms; alone, a network is measured after its own suppression
 _TORCH = KINDS
 _TORCH_CAMERAS = ("fasterrcnn", "ddq", "detectors", "mmdet")
-_SUPPRESSES = (*_TORCH, "shipped", "onnx-lidar")
+_SUPPRESSES = (*(kind for kind in _TORCH if kind != "bevfusion"), "shipped", "onnx-lidar")
 
 
 class NeedsError(Lcf3dError):
