@@ -136,6 +136,16 @@ def test_the_command_prints_and_writes(tmp_path, drive):
     assert (tmp_path / "table-2.json").is_file()
 
 
+def test_a_rehearsal_in_which_a_row_fails_has_failed(tmp_path, drive):
+    (tmp_path / "cut.pth").write_bytes(b"PK half a file")
+    command = ["paper", "table-1", "--kitti", str(drive[0]), "--out", str(tmp_path), "--row", "SECOND", "--json"]
+    command += ["--use", f"second-kitti={tmp_path / 'cut.pth'}"]
+    assert CliRunner().invoke(app, command).exit_code == 0
+    result = CliRunner().invoke(app, [*command, "--rehearse"])
+    assert result.exit_code == 1
+    assert "1 rows did not run, first table-1: SECOND" in result.output
+
+
 def test_what_is_absent_is_told_with_disk_and_hours(tmp_path):
     result = CliRunner().invoke(app, ["paper", "table-1", "--out", str(tmp_path), "--json"])
     assert result.exit_code == 0, result.output

@@ -10,6 +10,9 @@ import typer
 
 from lcf3d.errors import ConfigError, Lcf3dError
 
+FAILED = "not measured:"
+"""How the note of a row begins whose run failed."""
+
 if TYPE_CHECKING:
     from lcf3d.paper.tables import Row, Table
     from lcf3d.paper.workplace import Measured, Workplace
@@ -90,7 +93,10 @@ def paper(
             **_simulated({kind for one, _ in chosen for kind in one.data} - set(roots), out / "rehearsal"),
             **roots,
         }
-    return _measure(chosen, results, roots, uses, out, device, dry, overwrite, json_)
+    failed = _measure(chosen, results, roots, uses, out, device, dry, overwrite, json_)
+    if rehearse and failed:
+        typer.echo(f"error: {len(failed)} rows did not run, first {failed[0]}; the notes say why", err=True)
+        raise typer.Exit(1)
 
 
 def _simulated(kinds: set[str], folder: Path) -> dict[str, Path]:
@@ -113,8 +119,8 @@ def _measure(
     dry: bool,
     overwrite: bool,
     json_: bool,
-) -> None:
-    """Measure, print and write tables one after the other."""
+) -> list[str]:
+    """Measure, print and write tables one after the other; the rows that failed, not those that lack something."""
     import json
 
     from rich.console import Console
@@ -145,6 +151,8 @@ def _measure(
                 print_table(data)
     if json_:
         typer.echo(json.dumps(contents if len(contents) > 1 else contents[0], indent=2))
+    rows_of = [(content["table"], row) for content in contents for row in content["rows"]]
+    return [f"{t}: {row['name']}" for t, row in rows_of if any(n.startswith(FAILED) for n in row["notes"])]
 
 
 def _given(table: Table, results: list[str] | None) -> dict[str, Path]:
@@ -190,7 +198,7 @@ def _measured(table: Table, rows: tuple[Row, ...], place: Workplace) -> dict[str
         except ConfigError:
             raise
         except Lcf3dError as error:
-            measured[row.name] = without_values(table, f"not measured: {error}")
+            measured[row.name] = without_values(table, f"{FAILED} {error}")
     for row in absent:
         # what all of them take together, since a network runs once for all rows
         measured[row.name] = without_values(table, *measured[row.name].notes, about(table, absent))
