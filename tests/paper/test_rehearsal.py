@@ -41,7 +41,9 @@ def test_every_table_in_one_go_which_goes_on_where_it_was(tmp_path):
                 continue
             values = row["measured"]
             assert row["frames"] == 1, (name, row)
-            assert all(value is not None for column, value in values.items() if column != "FPS"), (name, row)
+            there = [value is not None for column, value in values.items() if column != "FPS"]
+            # in the front view of a single frame of nuScenes a class may have nobody
+            assert any(there) if name == "figure-2" else all(there), (name, row)
             for column, value in row["paper"].items():
                 if value is not None and values[column] is not None:
                     assert row["difference"][column] == pytest.approx(values[column] - value, abs=1e-6)
