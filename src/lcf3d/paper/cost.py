@@ -23,6 +23,11 @@ NETWORKS = {"lidar": "pointpillars-kitti", "camera": "fasterrcnn-r101-kitti"}
 _RUN: dict[int, tuple[str, ...]] = {LIDAR: ("lidar",), CAMERA: ("camera",), WHOLE: ("lidar", "camera")}
 
 
+def networks_of(table: Table, row: Row) -> tuple[str, ...]:
+    """Published names of all that a row runs; those that the costs are measured of too."""
+    return tuple(NETWORKS.values()) if table.measure == "cost" else row.networks
+
+
 def measure_costs(
     fusion_ms: Callable[[], Mapping[str, float]], uses: Mapping[str, str], device: str = "cpu"
 ) -> list[Costs]:

@@ -15,7 +15,7 @@ GROUPS = {"lidar": "lcf3d.lidar_detectors", "camera": "lcf3d.camera_detectors", 
 # LiDAR kinds that know the setting nms; alone, a network is measured after its own suppression
 _TORCH = KINDS
 _TORCH_CAMERAS = ("fasterrcnn", "ddq", "detectors", "mmdet")
-_SUPPRESSES = (*_TORCH, "shipped", "onnx-lidar")
+_SUPPRESSES = (*(kind for kind in _TORCH if kind != "bevfusion"), "shipped", "onnx-lidar")
 
 
 class NeedsError(Lcf3dError):
@@ -101,18 +101,19 @@ def branches(row: Row, uses: Mapping[str, str], device: str = "cpu") -> tuple[st
         raise NeedsError(*absent)
     lidar, camera, localizer = (with_device(spec, device) for spec in found)
     if not row.camera and plugins.parse(lidar).kind in _SUPPRESSES:
-        lidar = _with(lidar, "nms=keep")
+        lidar = with_setting(lidar, "nms=keep")
     return lidar, camera, localizer or "geometric"
 
 
-def _with(spec: str, setting: str) -> str:
+def with_setting(spec: str, setting: str) -> str:
+    """A string that names a network, with one more setting ``name=value``."""
     return f"{spec}{'&' if '?' in spec else '?'}{setting}"
 
 
 def with_device(spec: str, device: str) -> str:
     """What a command would name a network with, run on a torch device where torch runs it."""
     by_torch = spec.partition(":")[0] in (*_TORCH, *_TORCH_CAMERAS, "frustum-pointnet")
-    return _with(spec, f"device={device}") if by_torch and device != "cpu" else spec
+    return with_setting(spec, f"device={device}") if by_torch and device != "cpu" else spec
 
 
 def substitutes(row: Row, uses: Mapping[str, str]) -> tuple[str, ...]:

@@ -8,11 +8,11 @@ from typing import Any
 from lcf3d.errors import ConfigError
 from lcf3d.evaluation.domain_report import COLUMNS, table_values
 from lcf3d.evaluation.domain_shift import IOU_THRESHOLDS
-from lcf3d.evaluation.domain_tasks import FUSED, LIDAR_ALONE, DomainTask, DomainTaskRunner
+from lcf3d.evaluation.domain_tasks import FRONT, FUSED, LIDAR_ALONE, DomainTask, DomainTaskRunner
 from lcf3d.files import read_json, write_json
 from lcf3d.fusion.config import FusionConfig
 from lcf3d.paper.kept import Kept
-from lcf3d.paper.networks import substitutes
+from lcf3d.paper.networks import substitutes, with_setting
 from lcf3d.paper.tables import Row, Table
 from lcf3d.paper.workplace import Measured, Workplace, needed, root_of, run_name
 
@@ -27,6 +27,9 @@ def measure_shift(table: Table, row: Row, place: Workplace) -> Measured:
     """
     lidar, camera, _ = needed(table, row, place)
     trained, tested = row.task or ("", "")
+    if lidar.startswith("mvxnet:") and tested != trained:
+        # the one camera that it looks through has another name there
+        lidar = with_setting(lidar, f"camera={FRONT[tested]}")
     root = root_of(tested, place)
     split = "val" if (root / "ImageSets" / "val.txt").is_file() else None
     # a network's scores are probabilities; those of files may be anything

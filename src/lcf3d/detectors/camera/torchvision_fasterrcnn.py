@@ -181,9 +181,8 @@ class TorchvisionFasterRCNN:
         state = read_state_dict(file)
         config, classes = read_notes(file)
         told = normalization or normalization_of(config)
-        self._setup(state, class_names, score_threshold, style, device, told, classes)
-        if size is not None:
-            self.style = replace(self.style, image_size=parse_size(size))
+        image_size = None if size is None else parse_size(size)
+        self._setup(state, class_names, score_threshold, style, device, told, classes, image_size)
 
     @classmethod
     def from_state_dict(cls, state: Mapping[str, Any], **options: Any) -> TorchvisionFasterRCNN:
@@ -202,11 +201,13 @@ class TorchvisionFasterRCNN:
         device: str,
         normalization: str | None,
         classes: tuple[str, ...] = (),
+        image_size: tuple[int, int] | None = None,
     ) -> None:
         torchvision()
         if style is not None and style not in STYLES:
             raise ConfigError(f"style must be one of {', '.join(STYLES)}, got {style!r}")
         found = STYLES[style] if style is not None else find_style(state, classes)
+        found = found if image_size is None else replace(found, image_size=image_size)
         self.style = found if normalization is None else normalized(found, normalization)
         depth = 101 if "backbone.layer3.22.conv1.weight" in state else 50
         self.has_masks = any(name.startswith("roi_head.mask_head.") for name in state)
