@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 
 from lcf3d import plugins
 from lcf3d.cli.app import app
-from lcf3d.errors import ConfigError
+from lcf3d.errors import ConfigError, DatasetError
 from lcf3d.frame import Frame
 from lcf3d.fusion.alignment import realigned
 from lcf3d.fusion.calibration import Calibration
@@ -222,3 +222,48 @@ def test_a_run_says_loudly_that_a_camera_is_turned_and_how_to_mend_it(toy, tmp_p
     assert f"warning: {warning}" in lcf3d(*command[:-1], "--out", tmp_path / "told")
     monkeypatch.setattr(module, "FRONT", straight)
     assert json.loads(lcf3d(*command, "--out", tmp_path / "straight"))["warnings"] == []
+
+
+def test_a_frame_that_cannot_be_read_is_told_and_the_stream_goes_on(toy, monkeypatch):
+    from tests.datasets.toy import ToyDataset
+
+    inner = ToyDataset.frame
+
+    def frame(self, frame_id):
+        if frame_id == "f03":
+            raise DatasetError("frame f03 is damaged")
+        return inner(self, frame_id)
+
+    options = ["--rate", "0", "--recovery", "off", "--calibration", "none", "--json"]
+    monkeypatch.setattr(ToyDataset, "frame", frame)
+    report = json.loads(lcf3d("live", *toy, *options))
+    assert (report["frames"], report["results"]) == (11, 11)
+    assert report["unreadable"] == ["frame f03 is damaged"]
+    assert "1 frames could not be read in full, first: frame f03" in lcf3d("live", *toy, *options[:-1])
+
+
+def test_a_replay_that_is_interrupted_tells_what_came_so_far(toy, tmp_path, monkeypatch):
+    from tests.datasets.toy import ToyDataset
+
+    inner = ToyDataset.frame
+
+    def frame(self, frame_id):
+        if frame_id == "f05":
+            raise KeyboardInterrupt
+        return inner(self, frame_id)
+
+    monkeypatch.setattr(ToyDataset, "frame", frame)
+    health = tmp_path / "health.jsonl"
+    options = ["--rate", "0", "--recovery", "off", "--calibration", "none", "--health", health, "--hertz", "2"]
+    told = lcf3d("live", *toy, *options)
+    assert "5 results" in told
+    assert "then interrupted" in told
+    assert len(health.read_text().splitlines()) == 2
+
+
+@pytest.mark.parametrize("option", ["--pictures", "--health", "--rerun"])
+def test_a_place_that_cannot_be_written_to_is_told_before_the_stream(toy, tmp_path, option):
+    (tmp_path / "file").touch()
+    place = tmp_path / "file" / "deep.rrd"
+    with pytest.raises(OSError, match="file"):
+        CliRunner().invoke(app, ["live", *toy, "--rate", "4", option, str(place)], catch_exceptions=False)

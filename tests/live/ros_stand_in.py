@@ -73,6 +73,10 @@ class TransformException(Exception):
     pass
 
 
+class ExternalShutdownException(Exception):
+    pass
+
+
 class Buffer:
     def __init__(self, cache_time=None, node=None):
         self.known = {}
@@ -99,6 +103,7 @@ def modules(node):
     rclpy.spin = lambda node, executor=None: rclpy.calls.append(("spin", node))
     rclpy.try_shutdown = lambda *, context=None: rclpy.calls.append(("shutdown", None))
     found["rclpy.qos"] = SimpleNamespace(qos_profile_sensor_data="sensor data")
+    found["rclpy.executors"] = SimpleNamespace(ExternalShutdownException=ExternalShutdownException)
     found["rclpy.time"] = SimpleNamespace(Time=lambda seconds=0, nanoseconds=0: (seconds, nanoseconds))
     found["tf2_ros"] = SimpleNamespace(
         Buffer=Buffer, TransformException=TransformException, TransformListener=lambda buffer, node: object()

@@ -361,3 +361,86 @@ def test_the_watch_waits_while_a_message_is_taken_in():
     assert target._workers["watch"].wait_idle(20)
     assert target.watch.report("left").frames >= 1
     target.close()
+
+
+def test_what_is_no_message_is_refused_and_what_has_no_time_or_no_data_is_counted():
+    target = fuser()
+    with pytest.raises(ConfigError, match="not str"):
+        target.push("hello")
+    bad = [
+        LidarBoxes(None, boxes3d(street(0))),
+        CameraBoxes("soon", "left", boxes2d(camera(), street(0))),
+        CameraModel(np.nan, camera()),
+        CameraModel(0.0, None),
+        Scan(0.0, None),
+        Scan(0.0, np.full((3, 4), None)),
+        EgoPose(0.0, np.zeros((4, 4))),
+        EgoPose(0.0, np.diag([1.0, 1.0, -1.0, 1.0])),
+    ]
+    results = run(target, [*bad, *stream(3)])
+    assert len(results) == 3
+    assert all(r.fused.camera_names == ("left",) for r in results)
+    assert target.dropped() == {
+        "calibration left: broken": 1,
+        "calibration: broken": 1,
+        "camera left: broken": 1,
+        "lidar: broken": 1,
+        "pose: broken": 2,
+        "scan: broken": 2,
+    }
+
+
+def test_a_camera_that_sends_without_a_calibration_has_an_entry_of_its_own():
+    target, view = fuser(), camera("roof")
+    results = run(target, [*stream(3), CameraBoxes(0.21, "roof", boxes2d(view, street(0)))])
+    assert len(results) == 3
+    status = entry(target, "camera roof")
+    assert (status["level"], status["message"]) == (2, "has no calibration: nothing of it is used")
+    target.push(CameraModel(0.0, view))
+    assert entry(target, "camera roof")["level"] == 0
+
+
+def test_whatever_goes_wrong_in_a_moment_the_next_one_is_fused(monkeypatch):
+    target = fuser()
+    inner = target._frame
+    monkeypatch.setattr(target, "_frame", lambda group: 1 / 0 if 0.15 < group.time < 0.25 else inner(group))
+    results = run(target, stream(5))
+    assert [round(r.time, 1) for r in results] == [0.0, 0.1, 0.3, 0.4]
+    assert "1 frames could not be fused" in entry(target, "fusion")["message"]
+    assert "ZeroDivisionError" in value(target, "fusion", "last_error")
+
+
+def test_images_of_another_size_than_the_calibration_is_for_are_told_once():
+    target = fuser(detectors={"left": lambda images: [boxes2d(camera(), street(0))]})
+    for i in range(3):
+        target.push(Image(0.1 * i, "left", np.zeros((200, 500, 3), np.uint8)))
+    notes = value(target, "fusion", "notes")
+    assert notes.count("images of 500 x 200 pixels, but its calibration is for 1000 x 400") == 1
+
+
+def test_a_scan_detector_that_hangs_costs_its_moments_and_is_told():
+    release, points = threading.Event(), np.zeros((5, 4), np.float32)
+
+    def hanging(cloud):
+        release.wait(20)
+        return boxes3d(street(0))
+
+    target, view = fuser(realtime=True, lidar_detector=hanging, deadline=0.1), camera()
+    for i in range(5):
+        target.push(Scan(0.1 * i, points))
+        target.push(CameraBoxes(0.1 * i, "left", boxes2d(view, street(i))))
+    import time
+
+    time.sleep(0.12)
+    assert target.poll() == []
+    assert "has not answered" in entry(target, "lidar")["message"]
+    release.set()
+    target._workers["scan"].wait_idle(20)
+    # it answers again: new moments are fused
+    results = []
+    for i in range(5, 8):
+        results += target.push(Scan(0.1 * i, points))
+        results += target.push(CameraBoxes(0.1 * i, "left", boxes2d(view, street(i))))
+        target._workers["scan"].wait_idle(20)
+    assert len(results + target.flush()) >= 2
+    target.close()

@@ -97,7 +97,7 @@ def test_extrinsics_come_from_tf2_and_a_transform_that_is_late_is_waited_for(mon
     node.receive("left/camera_info", info())
     send(node, 1.0)
     assert len(node.publishers["fused/detections"].sent) == 1
-    assert np.allclose(target.fuser._models["left"][0][1].camera_from_lidar, matrix)
+    assert np.allclose(target.fuser._models.at("left", 0.0).camera_from_lidar, matrix)
 
 
 def test_boxes_of_another_frame_are_brought_into_the_lidars(monkeypatch):
@@ -231,3 +231,17 @@ def test_the_parameter_file_names_parameters_that_there_are():
     for name, value in values.items():
         if name in PARAMETERS:
             assert isinstance(value, type(PARAMETERS[name][0]))
+
+
+@pytest.mark.parametrize("separator", [(), ("--",)])
+def test_the_command_hands_everything_on_to_ros(monkeypatch, separator):
+    from typer.testing import CliRunner
+
+    from lcf3d.cli.app import app
+
+    node = Node("lcf3d", parameters=parameters())
+    rclpy = install(monkeypatch, node)["rclpy"]
+    given = ["--ros-args", "--params-file", "fuser.yaml", "-r", "__ns:=/front"]
+    result = CliRunner().invoke(app, ["ros2", *separator, *given], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    assert rclpy.calls[0] == ("init", given)

@@ -69,7 +69,9 @@ def command(only: str | None = None) -> typer.Typer:
     made.callback()(_options)
     for verb, module in VERBS.items():
         if only in (None, verb):
-            made.command(verb)(getattr(import_module(f"lcf3d.cli.{module}"), verb))
+            # what goes on to ROS is not ours to know
+            passing = {"ignore_unknown_options": True} if verb == "ros2" else {}
+            made.command(verb, context_settings=passing)(getattr(import_module(f"lcf3d.cli.{module}"), verb))
     for group, module in GROUPS.items():
         if only in (None, group):
             made.add_typer(getattr(import_module(f"lcf3d.cli.{module}"), group))

@@ -96,6 +96,7 @@ def _print(report: ReplayReport, sentences: list[str]) -> None:
     out = console()
     out.print(
         f"{report.frames} frames in {report.seconds:.1f} s: {report.results} results, {report.behind} behind time"
+        + (", then interrupted" if report.interrupted else "")
     )
     table = Table("stage", "median ms", "99th percentile")
     for part, values in report.latency_ms.items():
@@ -103,8 +104,11 @@ def _print(report: ReplayReport, sentences: list[str]) -> None:
     out.print(table)
     for sentence in sentences:
         out.print(sentence, soft_wrap=True)
+    if report.unreadable:
+        first = report.unreadable[0]
+        out.print(f"{len(report.unreadable)} frames could not be read in full, first: {first}", soft_wrap=True)
     for cause, count in report.dropped.items():
         out.print(f"dropped, {cause}: {count}")
     for status in report.diagnostics:
-        level = ("ok", "warning", "error", "silent")[status["level"]]
-        out.print(f"{status['hardware_id']}: {level}, {status['message']}", soft_wrap=True)
+        level = ("", "warning, ", "error, ", "silent, ")[status["level"]]
+        out.print(f"{status['hardware_id']}: {level}{status['message']}", soft_wrap=True)

@@ -8,11 +8,11 @@ import typer
 
 
 def ros2(
-    arguments: Annotated[list[str] | None, typer.Argument(help="after --, what goes to ROS: --ros-args ...")] = None,
+    arguments: Annotated[list[str] | None, typer.Argument(help="what goes to ROS: --ros-args ...")] = None,
 ) -> None:
     """Run the fusion as a ROS 2 node, in a shell where ROS 2 is sourced; see docs/live.md for topics and parameters.
 
-    Example: lcf3d ros2 -- --ros-args --params-file fuser.yaml
+    Example: lcf3d ros2 --ros-args --params-file fuser.yaml
     """
     from lcf3d.live.ros2 import spin
 

@@ -57,8 +57,14 @@ class Diagnostics:
         self._quickest = min(delays, default=0.0)
 
     def entries(self, cameras: Sequence[str]) -> list[dict[str, Any]]:
-        """Those of the fusion, of LiDAR, and of all calibrated cameras."""
-        return [self._of_fusion(), self._of_lidar(), *(self._of_camera(name) for name in cameras)]
+        """Those of the fusion, of LiDAR, of all calibrated cameras, and of those that send without a calibration."""
+        sending = [source.removeprefix("camera ") for source in self._health.streams if source.startswith("camera ")]
+        unknown = [name for name in sending if name not in cameras]
+        entries = [self._of_fusion(), self._of_lidar(), *(self._of_camera(name) for name in cameras)]
+        for name in unknown:
+            told = "has no calibration: nothing of it is used"
+            entries.append(_entry(f"camera {name}", ERROR, [told], self._values([f"camera {name}"])))
+        return entries
 
     def _of_fusion(self) -> dict[str, Any]:
         health, errors = self._health, self._errors

@@ -20,6 +20,7 @@ from lcf3d.fusion.memory import remember
 from lcf3d.fusion.memory_config import MemoryConfig
 from lcf3d.fusion.memory_state import Memory
 from lcf3d.fusion.pipeline import LateCascadeFusion
+from lcf3d.live.calibrations import Calibrations
 from lcf3d.live.counting import Tally
 from lcf3d.live.diagnostics import Diagnostics
 from lcf3d.live.health import Health
@@ -33,13 +34,12 @@ from lcf3d.live.messages import (
     Scan,
     is_whole,
     plain_points,
-    same_mount,
     source_of,
 )
 from lcf3d.live.poses import PoseBuffer
 from lcf3d.live.settings import LiveResult, LiveSettings
 from lcf3d.live.synchronizer import CameraPart, Group, Synchronizer
-from lcf3d.live.warming import made_up_cameras, rehearsal
+from lcf3d.live.warming import made_up_cameras, rehearsal, settings_of_rehearsal
 from lcf3d.live.watching import WatchFeed
 from lcf3d.live.workers import Worker, attempt
 from lcf3d.provenance import FusedDetections
@@ -87,15 +87,14 @@ class Fuser:
         self._memory_config = memory_settings(fusion.calibration, given) if memory else None
         self._memory: Memory | None = None
         self._on_result = on_result
-        self._models: dict[str, list[tuple[float, Camera]]] = {c.name: [(-np.inf, c)] for c in cameras}
+        self._models = Calibrations(cameras)
         self._detectors: dict[str, Any] = {f"camera {n}": d for n, d in (camera_detectors or {}).items()}
         if lidar_detector is not None:
             self._detectors["scan"] = lidar_detector
         named = {*(camera_detectors or {}), *self.settings.sync.offsets}
-        if cameras and not named <= set(self._models):
-            raise ConfigError(
-                f"there is no camera {sorted(named - set(self._models))}; the cameras are {sorted(self._models)}"
-            )
+        unknown = sorted(named - set(self._models.names))
+        if cameras and unknown:
+            raise ConfigError(f"there is no camera {unknown}; the cameras are {sorted(self._models.names)}")
         self.health = Health(fusion.config.class_names)
         self._sync = Synchronizer(self.settings.sync, Tally(self.health.clock))
         self._poses = PoseBuffer()
@@ -138,7 +137,7 @@ class Fuser:
         A detector that fails on it is reported and stops nothing.
         """
         with self._lock:
-            known = [replace(self._model(name, np.inf), delay=0.0) for name in self._models]
+            known = [replace(self._models.at(name, np.inf), delay=0.0) for name in self._models.names]
         cameras = known or made_up_cameras()
         for detectors in ({}, self._detectors) if self._detectors else ({},):
             twin = self._twin(cameras, detectors)
@@ -152,14 +151,7 @@ class Fuser:
 
     def _twin(self, cameras: Sequence[Camera], detectors: Mapping[str, Any]) -> Fuser:
         """A fuser with the same parts, to rehearse with: nothing in threads, and its watch looks at every moment."""
-        watch = self.settings.watch
-        settings = replace(
-            self.settings,
-            sync=replace(self.settings.sync, offsets={}),
-            realtime=False,
-            watch=None if watch is None else replace(watch, every=1, recent=2),
-            watch_period=0.0,
-        )
+        settings = settings_of_rehearsal(self.settings)
         twin = Fuser(self.fusion, cameras, settings=settings, memory=self._memory_config or False)
         twin._detectors = dict(detectors)
         return twin
@@ -188,7 +180,7 @@ class Fuser:
             }
             late = {name: s for name, s in hanging.items() if s > self.settings.sync.deadline}
             quiet = self.health.quiet(perf_counter()) if self.settings.realtime else 0.0
-            return Diagnostics(self.health, self._sync, reports, late, quiet).entries(list(self._models))
+            return Diagnostics(self.health, self._sync, reports, late, quiet).entries(self._models.names)
 
     def _locked(self, action: Callable[[], None], everything: bool = False) -> list[LiveResult]:
         with self._lock:
@@ -206,15 +198,20 @@ class Fuser:
             pass
 
     def _take(self, message: Message, arrival: float) -> None:
-        source = source_of(message)
-        if isinstance(message, CameraModel):
-            self._learn_camera(message)
-            return
-        if isinstance(message, Image | CameraBoxes) and message.camera not in self._models:
-            self.health.tell_once(f"camera {message.camera} has no calibration yet: its messages wait for one")
+        # without a name not even this can be told
+        whole = not isinstance(message, CameraModel) or isinstance(message.camera, Camera)
+        source = source_of(message) if whole else "calibration"
         if not is_whole(message):
             self._sync.dropped.add((source, "broken"))
             return
+        if isinstance(message, CameraModel):
+            self._learn_camera(message)
+            return
+        if isinstance(message, Image | CameraBoxes) and message.camera not in self._models.names:
+            self.health.tell_once(f"camera {message.camera} has no calibration yet: its messages wait for one")
+        misfit = self._models.misfit(message) if isinstance(message, Image) else None
+        if misfit is not None:
+            self.health.tell_once(misfit)
         self.health.saw(source, message, arrival)
         restarts = self._sync.restarts
         admitted = self._sync.admit(source, message.time)
@@ -241,30 +238,14 @@ class Fuser:
         """Time went back: poses are of another time, and the latest calibrations hold from now on."""
         self.health.began_anew()
         self._poses.clear()
-        for name, known in self._models.items():
-            self._models[name] = [(-np.inf, known[-1][1])]
+        self._models.begin_anew()
 
     def _learn_camera(self, message: CameraModel) -> None:
-        """A calibration that is new, or that changes in the middle.
-
-        Where it differs by more than the motion of a car between scan and image, the watch begins anew.
-        """
-        known = self._models.setdefault(message.camera.name, [])
-        anew = bool(known) and not same_mount(known[-1][1], message.camera)
-        if anew:
+        """A calibration that is new, or that changes in the middle: the watch of that camera then begins anew."""
+        if self._models.learn(message, self._sync.closed):
             self.health.tell(f"camera {message.camera.name}: new calibration at {message.time:.3f} s")
-        known.append((message.time if known else -np.inf, message.camera))
-        known.sort(key=lambda entry: entry[0])
-        # those that no group to come can ask for
-        while len(known) > 1 and known[1][0] <= self._sync.closed:
-            known.pop(0)
-        if anew and self.watch is not None:
-            self.watch.forget(message.camera.name)
-
-    def _model(self, name: str, time: float) -> Camera:
-        """A camera as its calibration was at some time."""
-        valid = [camera for since, camera in self._models[name] if since <= time]
-        return valid[-1] if valid else self._models[name][0][1]
+            if self.watch is not None:
+                self.watch.forget(message.camera.name)
 
     def _detect(self, source: str, message: Scan | Image, arrival: float) -> None:
         """Run a detector now, or hand the message to its thread."""
@@ -312,8 +293,11 @@ class Fuser:
     def _advance(self, everything: bool) -> None:
         """Fuse the groups that are ready."""
         newest = self._poses.newest if self.settings.sync.poses else np.inf
-        for group in self._sync.ready(frozenset(self._models), newest, everything):
-            self._fuse(group)
+        for group in self._sync.ready(frozenset(self._models.names), newest, everything):
+            # whatever a message has in it, the next one is taken in
+            _, error = attempt(self._fuse, group)
+            if error is not None:
+                self.health.failed("fusion", error)
         if self._feed is not None:
             self._feed.advance(everything)
         if len(self._detect_ms) > 64:
@@ -325,7 +309,7 @@ class Fuser:
         begun = perf_counter()
         frame, nominal = self._frame(group)
         blinded = self.health.blinded() if self.settings.leave_out_blinded else frozenset()
-        found = {n: p.detections for n, p in group.cameras.items() if n in self._models and n not in blinded}
+        found = {n: p.detections for n, p in group.cameras.items() if n in self._models.names and n not in blinded}
         result, error = attempt(lambda lidar: self.fusion(frame, lidar, found), group.lidar)
         if error is not None:
             self.health.failed("fusion", error)
@@ -365,7 +349,7 @@ class Fuser:
     ) -> None:
         """What takes time and no result waits for: health and the calibration watch."""
         assert group.lidar is not None
-        found = {name: part.detections for name, part in group.cameras.items() if name in self._models}
+        found = {name: part.detections for name, part in group.cameras.items() if name in self._models.names}
         self.health.fused(frame, result, found, latency, group.points)
         if self._feed is not None:
             self._feed.offer(group.time, nominal, group.lidar, found)
@@ -373,8 +357,8 @@ class Fuser:
     def _frame(self, group: Group) -> tuple[Frame, Frame]:
         """What is fused, with each camera as it stood at its own moment; and the same without corrections."""
         nominal, corrected = [], []
-        for name in self._models:
-            camera = self._model(name, group.time)
+        for name in self._models.names:
+            camera = self._models.at(name, group.time)
             part = group.cameras.get(name)
             shift = 0.0 if part is None else part.time - group.time
             nominal.append(self._moved(camera, group.time, shift))
@@ -401,7 +385,8 @@ class Fuser:
     def _notes(self, group: Group, blinded: Iterable[str]) -> list[str]:
         notes = [f"camera {n} sees far less than it used to and was not used" for n in sorted(blinded)]
         notes += [
-            f"camera {n} has no calibration and was not used" for n in sorted(set(group.cameras) - {*self._models})
+            f"camera {n} has no calibration and was not used"
+            for n in sorted(set(group.cameras) - {*self._models.names})
         ]
         if len(self._poses) and any(
             p.time != group.time and self._poses.motion(group.time, p.time) is None for p in group.cameras.values()

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from lcf3d.errors import ConfigError
 from lcf3d.structures import Camera, Detections2D, Detections3D, FloatArray
 
 
@@ -65,25 +66,48 @@ Message = Scan | LidarBoxes | Image | CameraBoxes | EgoPose | CameraModel
 
 
 def source_of(message: Message) -> str:
-    """Name of the stream that a message belongs to: ``lidar``, ``scan``, ``pose`` or ``camera NAME``."""
+    """Name of the stream that a message belongs to: ``lidar``, ``scan``, ``pose`` or ``camera NAME``.
+
+    Raises:
+        ConfigError: it is no message.
+    """
     if isinstance(message, Image | CameraBoxes):
         return f"camera {message.camera}"
     if isinstance(message, CameraModel):
         return f"calibration {message.camera.name}"
-    return {Scan: "scan", LidarBoxes: "lidar", EgoPose: "pose"}[type(message)]
+    for kind, source in ((Scan, "scan"), (LidarBoxes, "lidar"), (EgoPose, "pose")):
+        if isinstance(message, kind):
+            return source
+    raise ConfigError(
+        f"a stream takes Scan, LidarBoxes, Image, CameraBoxes, EgoPose and CameraModel, not {type(message).__name__}"
+    )
 
 
 def is_whole(message: Message) -> bool:
-    """Whether a message's data has the shape that it should: what was cut off on the way has not."""
+    """Whether a message has a time and its data the shape that it should: what was cut off on the way has not."""
+    if not isinstance(message.time, int | float | np.integer | np.floating):
+        return False
+    if isinstance(message, CameraModel):
+        return isinstance(message.camera, Camera) and bool(np.isfinite(message.time))
     if isinstance(message, Scan):
-        return np.ndim(message.points) == 2 and np.shape(message.points)[1] >= 3
+        points = message.points
+        known = isinstance(points, np.ndarray) and np.issubdtype(points.dtype, np.number)
+        return known and points.ndim == 2 and points.shape[1] >= 3
     if isinstance(message, Image):
         return np.ndim(message.pixels) == 3 and np.shape(message.pixels)[2] == 3
     if isinstance(message, EgoPose):
-        return np.shape(message.world_from_lidar) == (4, 4) and bool(np.isfinite(message.world_from_lidar).all())
+        return _is_rigid(message.world_from_lidar)
     if isinstance(message, LidarBoxes):
         return isinstance(message.detections, Detections3D)
-    return not isinstance(message, CameraBoxes) or isinstance(message.detections, Detections2D)
+    return isinstance(message.detections, Detections2D)
+
+
+def _is_rigid(transform: FloatArray) -> bool:
+    """Whether something is a (4, 4) rotation and translation, but for rounding."""
+    if np.shape(transform) != (4, 4) or not np.isfinite(transform).all():
+        return False
+    rotation = np.asarray(transform)[:3, :3]
+    return bool(np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-2) and np.linalg.det(rotation) > 0)
 
 
 def plain_points(points: NDArray[np.floating]) -> NDArray[np.float32]:

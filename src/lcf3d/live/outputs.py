@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,6 +89,7 @@ class Outputs:
 
     Raises:
         ConfigError: ``rerun`` is neither.
+        OSError: a place that cannot be written to.
         MissingExtraError: rerun-sdk is not installed, and a recording is wanted.
     """
 
@@ -102,12 +103,17 @@ class Outputs:
         health: Path | None = None,
         cameras: Sequence[str] = (),
     ) -> None:
-        self._fuser, self._health = fuser, health
-        self._lines: list[str] = []
+        self._fuser = fuser
+        self._health: IO[str] | None = None
         self._said = 0.0
         self._outputs: list[tuple[Output, Callable[[LiveResult], Any]]] = []
         self._log: Any = None
+        if health is not None:
+            health.parent.mkdir(parents=True, exist_ok=True)
+            # line by line, so that it can be followed and nothing is lost
+            self._health = health.open("w", encoding="utf-8", buffering=1)
         if pictures is not None:
+            pictures.mkdir(parents=True, exist_ok=True)
             trails = Trails()
             self._outputs.append(
                 (Output("pictures", lambda r: draw_result(r, pictures, trails), realtime), lambda r: r)
@@ -127,7 +133,7 @@ class Outputs:
                 output(task_of(result))
         if self._health is not None and results and not 0 <= results[-1].time - self._said < HEALTH_PERIOD:
             self._said = results[-1].time
-            self._lines.append(json.dumps({"time": self._said, "status": self._fuser.diagnostics()}))
+            self._health.write(json.dumps({"time": self._said, "status": self._fuser.diagnostics()}) + "\n")
 
     def warm_up(self) -> None:
         """Compile what draws, so that the first picture does not take time from the first frames."""
@@ -142,9 +148,7 @@ class Outputs:
         if self._log is not None:
             self._log.close()
         if self._health is not None:
-            from lcf3d.files import write_text
-
-            write_text(self._health, "".join(f"{line}\n" for line in self._lines))
+            self._health.close()
         return [output.report() for output, _ in self._outputs]
 
     def _with_health(self, result: LiveResult) -> tuple[LiveResult, dict[str, float], list[dict[str, Any]]]:

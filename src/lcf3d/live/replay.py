@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from lcf3d.datasets.base import CameraSource, Dataset, LidarSource
+from lcf3d.errors import Lcf3dError
 from lcf3d.frame import Frame
 from lcf3d.fusion.alignment_watch import WatchSettings
 from lcf3d.fusion.memory_config import MemoryConfig
@@ -37,6 +38,8 @@ class ReplayReport:
         latency_ms: median and 99th percentile by stage.
         behind: frames that could not be pushed at their time.
         seconds: how long it took.
+        unreadable: what was said of frames that could not be read, or not in full.
+        interrupted: somebody stopped it (Ctrl-C) before the end.
         diagnostics: health at the end.
     """
 
@@ -46,6 +49,8 @@ class ReplayReport:
     latency_ms: dict[str, dict[str, float]] = field(default_factory=dict)
     behind: int = 0
     seconds: float = 0.0
+    unreadable: list[str] = field(default_factory=list)
+    interrupted: bool = False
     diagnostics: list[dict[str, Any]] = field(default_factory=list)
 
     def to_json(self) -> dict[str, Any]:
@@ -179,20 +184,19 @@ def replay(
     report = ReplayReport()
     known: dict[str, Camera] = {}
     start = time.perf_counter()
-    before: Frame | None = None
-    now = 0.0
-    for frame_id in frame_ids:
-        frame = dataset.frame(frame_id)
-        if before is not None:
-            same = before.sequence == frame.sequence
-            now += frame_times([before.timestamp, frame.timestamp], hertz)[1] if same else PAUSE
-        before = frame
-        messages = list(frame_messages(frame, now, lidar, cameras, known, fuser.settings.sync.scans, shown))
-        if rate > 0:
-            _wait_until(start + now / rate, report, fuser, on_results)
-        for message in messages:
-            _collect(fuser.push(message), report, on_results)
-        report.frames += 1
+    try:
+        for now, frame in _moments(dataset, frame_ids, hertz, report):
+            messages = _readable(
+                frame_messages(frame, now, lidar, cameras, known, fuser.settings.sync.scans, shown), report
+            )
+            if rate > 0:
+                _wait_until(start + now / rate, report, fuser, on_results)
+            for message in messages:
+                _collect(fuser.push(message), report, on_results)
+            report.frames += 1
+    except KeyboardInterrupt:
+        # what came so far is told all the same
+        report.interrupted = True
     if rate > 0 and fuser.settings.realtime:
         time.sleep(fuser.settings.sync.deadline)
         _collect(fuser.poll(), report, on_results)
@@ -206,6 +210,36 @@ def replay(
     report.diagnostics = fuser.diagnostics()
     fuser.close()
     return report
+
+
+def _moments(
+    dataset: Dataset, frame_ids: Sequence[str], hertz: float, report: ReplayReport
+) -> Iterator[tuple[float, Frame]]:
+    """Each frame that can be read, with its time on a clock that always goes on."""
+    before: Frame | None = None
+    now = 0.0
+    for frame_id in frame_ids:
+        try:
+            frame = dataset.frame(frame_id)
+        except Lcf3dError as error:
+            report.unreadable.append(str(error))
+            continue
+        if before is not None:
+            same = before.sequence == frame.sequence
+            now += frame_times([before.timestamp, frame.timestamp], hertz)[1] if same else PAUSE
+        before = frame
+        yield now, frame
+
+
+def _readable(messages: Iterator[Message], report: ReplayReport) -> list[Message]:
+    """The messages of a frame up to one that cannot be read: a stream goes on without it."""
+    read = []
+    try:
+        for message in messages:
+            read.append(message)
+    except Lcf3dError as error:
+        report.unreadable.append(str(error))
+    return read
 
 
 def _wait_until(

@@ -259,7 +259,7 @@ def spin(arguments: list[str] | None = None) -> None:
         settle_memory()
         rclpy.spin(node)
         del listener
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, import_module("rclpy.executors").ExternalShutdownException):
         pass
     finally:
         node.destroy_node()

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import gc
 from collections.abc import Collection, Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 import PIL.Image
@@ -16,6 +17,7 @@ from lcf3d.datasets.drive import ShippedFrame, read_drive
 from lcf3d.distortion import Distortion
 from lcf3d.geometry.camera import project_boxes
 from lcf3d.live.messages import CameraBoxes, EgoPose, Image, LidarBoxes, Message, Scan
+from lcf3d.live.settings import LiveSettings
 from lcf3d.structures import Camera, Detections2D, Detections3D, FloatArray
 
 # moments, and seconds between them: enough for the watch's window and for tracks that are seen, missed and predicted
@@ -45,6 +47,18 @@ def made_up_cameras() -> list[Camera]:
         Camera("warm-up", projection, axes, 1000, 400),
         Camera("warm-up lens", projection, axes, 1000, 400, distortion=lens),
     ]
+
+
+def settings_of_rehearsal(settings: LiveSettings) -> LiveSettings:
+    """Nothing in threads, cameras that look with the scan, and a watch that looks at every moment."""
+    watch = settings.watch
+    return replace(
+        settings,
+        sync=replace(settings.sync, offsets={}),
+        realtime=False,
+        watch=None if watch is None else replace(watch, every=1, recent=2),
+        watch_period=0.0,
+    )
 
 
 def rehearsal(
@@ -92,7 +106,7 @@ def _objects(camera: Camera, further: float) -> FloatArray:
 
 def _surface(box: FloatArray) -> np.ndarray[tuple[int, int], np.dtype[np.float32]]:
     """Points on an object and on the ground about it."""
-    u, v = (grid.ravel() for grid in np.meshgrid(np.linspace(-0.5, 0.5, 20), np.linspace(-0.5, 0.5, 20)))
+    u, v = np.array(np.meshgrid(np.linspace(-0.5, 0.5, 20), np.linspace(-0.5, 0.5, 20))).reshape(2, -1)
     side = np.column_stack([u * box[3], np.full(len(u), box[4] / 2), v * box[5]])
     front = np.column_stack([np.full(len(u), -box[3] / 2), u * box[4], v * box[5]])
     ground = np.column_stack([u * 12, v * 12, np.full(len(u), -box[5] / 2)])

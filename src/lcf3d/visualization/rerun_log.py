@@ -171,7 +171,9 @@ class RerunLog:
                     array=found.boxes,
                     array_format=self._rerun.Box2DFormat.XYXY,
                     colors=np.array(colours, dtype=np.uint8).reshape(-1, 3),
+                    # shown under the pointer: all at once they would hide what they name
                     labels=list(found.texts),
+                    show_labels=False,
                 ),
             )
 
