@@ -4,8 +4,8 @@ Most objects stand still, and tracks say where the others went: the planar motio
 the tracks is the sensor's. It is solved by least squares with weights that fall with the residual, so that what moves
 unforeseen or is no object at all counts little.
 
-Poses have a scale of their own: wheels wear, and odometry from a stereo pair is as long as its baseline is well known. A
-step 3 % too long makes a parked car creep by 0.3 m a second at 10 m/s, which is enough to lose it. So the scale is
+Poses have a scale of their own: wheels wear, and odometry from a stereo pair is as long as its baseline is well known.
+A step 3 % too long makes a parked car creep by 0.3 m a second at 10 m/s, which is enough to lose it. So the scale is
 learned from the objects that seem to creep along with the sensor.
 """
 

@@ -1,10 +1,12 @@
 """How tracked objects move: constant velocity and turn rate, with Kalman filters in closed form.
 
 Position noise is taken as equal along both axes, so that one 2 x 2 covariance (three numbers) serves x and y, and a
-step is a handful of operations on whole columns. Beside it stands a second one for objects that do not move at all (two
-models, weighed by how well they foretold each measurement): most cars are parked, and a parked car that nothing sees for
-two seconds is where it was, while one that may move is not known to half a metre. Yaw and yaw rate have a filter of the same form. What turns (cars,
+step is a handful of operations on whole columns. Yaw and yaw rate have a filter of the same form. What turns (cars,
 riders) has its velocity turned along and drawn towards its heading; people walk where they like.
+
+Beside that filter runs one for objects that stand, and both are weighed by how well they foretold each measurement (a
+pair of models, autonomous but that what moves may stop). Most cars are parked: one that nothing sees for two seconds is
+where it was, while a filter that lets it move loses it by half a metre.
 
 The loops are compiled. Numbers that numpy's own functions give (exponentials, powers) are handed to them.
 """

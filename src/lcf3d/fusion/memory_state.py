@@ -87,10 +87,11 @@ class Tracks:
 
     @property
     def positions(self) -> FloatArray:
-        """(T, 2) x and y of the centre: between where it is if it moves and if it stands, by how probable each is."""
-        moving = self.moving_positions
-        mixed: FloatArray = moving + self.standing[:, None] * (self.values[:, STANDING_X:STANDING_COV] - moving)
-        return mixed
+        """(T, 2) x and y of the centre: where it is if it stands or if it moves, whichever is more probable."""
+        likelier: FloatArray = np.where(
+            self.standing[:, None] > 0.5, self.values[:, STANDING_X:STANDING_COV], self.moving_positions
+        )
+        return likelier
 
     @property
     def moving_positions(self) -> FloatArray:
