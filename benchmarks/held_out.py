@@ -5,13 +5,18 @@
 
 The shipped networks are run once a frame: the LiDAR's without suppression on the scan as it is and on one in four of
 its beams, the camera's on both images. Rows: those of ``lcf3d ablate`` (left camera, ``--localizer``), stereo pairs
-beside one camera, and the localizers; 3D AP R40 (KITTI, moderate), mean centre-distance AP, and the gain over the LiDAR
-alone with 95 % bootstrap intervals over frames. A folder that is still being simulated is taken as far as it has come.
+beside one camera, and the localizers; 3D AP R40 (KITTI, moderate), mean centre-distance AP, and for the modules the
+gain over the LiDAR alone with 95 % bootstrap intervals over frames. A folder that is still being simulated is taken as
+far as it has come.
+
+What the networks find is kept in HELDOUT/detections-WEIGHTS, one file a frame, named after the weights: the tables can
+be made again, or in a process for each LiDAR (``--lidars``), without running them; ``--detect-only`` makes the files.
 """
 
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -21,11 +26,13 @@ import numpy as np
 
 from lcf3d.datasets.drive import every_beam
 from lcf3d.datasets.kitti import KittiDataset
+from lcf3d.detectors.lidar.kinds import MODELS
 from lcf3d.detectors.named import load_detector
-from lcf3d.evaluation.ablation import Variant, suppressed, variants
+from lcf3d.evaluation.ablation import MODULES, Variant, suppressed, variants
 from lcf3d.evaluation.domain_shift import evaluate_shift, split_truth
 from lcf3d.evaluation.kitti_task import KittiEvaluation
 from lcf3d.evaluation.protocol import EvaluationOptions
+from lcf3d.files import atomic_path
 from lcf3d.frame import Frame
 from lcf3d.fusion.config import FusionConfig
 from lcf3d.fusion.pipeline import LateCascadeFusion
@@ -34,9 +41,10 @@ from lcf3d.localizers.combined import CombinedLocalizer
 from lcf3d.localizers.geometric import GeometricLocalizer
 from lcf3d.localizers.named import ShippedLocalizer
 from lcf3d.reasons import Outcome
-from lcf3d.structures import KITTI_CLASSES, Detections2D, Detections3D
+from lcf3d.structures import KITTI_CLASSES, Detections2D, Detections3D, InstanceMask
 
 LIDARS = {"64 beams": 1, "16 beams": 4}
+WITH_INTERVALS = (MODULES, "these settings")
 LOCALIZERS: dict[str, Callable[[], Any]] = {
     "geometric": GeometricLocalizer,
     "network": ShippedLocalizer,
@@ -51,14 +59,21 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=1000, help="at most so many")
     parser.add_argument("--samples", type=int, default=1000, help="draws of the frames for the intervals")
     parser.add_argument("--localizer", choices=list(LOCALIZERS), default="network", help="of the rows of the ablation")
+    parser.add_argument("--lidars", default=",".join(LIDARS), help=f"tables to make, of {', '.join(LIDARS)}")
+    parser.add_argument("--detect-only", action="store_true", help="run the networks, make no tables")
     parser.add_argument("--json", type=Path, help="write the figures to this file")
     options = parser.parse_args()
     ids = sorted(path.stem for path in (options.root / "training" / "label_2").glob("*.txt"))[: options.frames]
     dataset = KittiDataset(options.root, class_names=(*KITTI_CLASSES, "Van", "Person_sitting"))
-    frames, lidar, camera = detect(dataset, ids)
+    weights = [MODELS / f"{name}_kitti.onnx" for name in ("camera", "lidar")]
+    mark = hashlib.sha256(b"".join(path.read_bytes() for path in weights)).hexdigest()[:8]
+    frames, lidar, camera = detect(dataset, ids, options.root / f"detections-{mark}")
+    if options.detect_only:
+        return
     evaluation = KittiEvaluation(KittiDataset(options.root), ids, EvaluationOptions())
     tables = {}
-    for name, step in LIDARS.items():
+    for name in options.lidars.split(","):
+        step = LIDARS[name]
         thinned = [
             Frame(f.id, every_beam(_points(f), step), f.cameras, {}, f.labels) if step > 1 else f for f in frames
         ]
@@ -77,21 +92,64 @@ def main() -> None:
 
 
 def detect(
-    dataset: KittiDataset, ids: Sequence[str]
+    dataset: KittiDataset, ids: Sequence[str], kept: Path
 ) -> tuple[list[Frame], dict[str, list[Detections3D]], list[dict[str, Detections2D]]]:
-    """Frames without images, and what the networks find in them."""
+    """Frames without images, and what the networks find in them: read from ``kept`` where it is there."""
     look = load_detector("shipped:kitti?threads=1", "camera", KITTI_CLASSES)
     scan = load_detector("shipped:kitti?nms=off&threads=1", "lidar", KITTI_CLASSES)
+    kept.mkdir(exist_ok=True)
     frames: list[Frame] = []
     lidar: dict[str, list[Detections3D]] = {name: [] for name in LIDARS}
     camera: list[dict[str, Detections2D]] = []
     for frame_id in ids:
-        frame = dataset.frame(frame_id)
-        camera.append({name: look([image])[0] for name, image in frame.images.items()})
-        for name, step in LIDARS.items():
-            lidar[name].append(scan(every_beam(_points(frame), step) if step > 1 else _points(frame)))
+        frame, path = dataset.frame(frame_id), kept / f"{frame_id}.npz"
+        if not path.is_file():
+            seen = {name: look([image])[0] for name, image in frame.images.items()}
+            boxes = {
+                name: scan(every_beam(_points(frame), step) if step > 1 else _points(frame))
+                for name, step in LIDARS.items()
+            }
+            write_detections(path, seen, boxes)
+        seen, boxes = read_detections(path)
+        camera.append(seen)
+        for name, found in boxes.items():
+            lidar[name].append(found)
         frames.append(Frame(frame.id, frame.points, frame.cameras, {}, frame.labels))
     return frames, lidar, camera
+
+
+def write_detections(path: Path, seen: Mapping[str, Detections2D], boxes: Mapping[str, Detections3D]) -> None:
+    """Keep what the networks found in a frame."""
+    arrays: dict[str, Any] = {}
+    for name, found in (*seen.items(), *boxes.items()):
+        arrays |= {f"{name}/{part}": getattr(found, part) for part in ("boxes", "scores", "labels")}
+    for name, found in seen.items():
+        masks = found.masks or ()
+        arrays[f"{name}/places"] = np.array([[m.x, m.y, *m.bitmap.shape] if m else [0] * 4 for m in masks], dtype=int)
+        bitmaps = [m.bitmap.ravel() for m in masks if m]
+        arrays[f"{name}/bitmaps"] = np.packbits(np.concatenate([np.zeros(0, dtype=bool), *bitmaps]))
+    with atomic_path(path) as temporary:
+        np.savez_compressed(temporary, allow_pickle=False, **arrays)
+
+
+def read_detections(path: Path) -> tuple[dict[str, Detections2D], dict[str, Detections3D]]:
+    """What `write_detections` kept."""
+    with np.load(path, allow_pickle=False) as file:
+        arrays = dict(file)
+    cameras = [name.partition("/")[0] for name in arrays if name.endswith("/bitmaps")]
+    parts = ("boxes", "scores", "labels")
+    boxes = {name: Detections3D(*(arrays[f"{name}/{part}"] for part in parts), KITTI_CLASSES) for name in LIDARS}
+    seen = {}
+    for name in cameras:
+        masks: list[InstanceMask | None] = []
+        bits, begin = np.unpackbits(arrays[f"{name}/bitmaps"]).astype(bool), 0
+        for x, y, height, width in arrays[f"{name}/places"].tolist():
+            bitmap = bits[begin : begin + height * width].reshape(height, width)
+            masks.append(InstanceMask(x, y, bitmap) if bitmap.size else None)
+            begin += height * width
+        found = (arrays[f"{name}/{part}"] for part in parts)
+        seen[name] = Detections2D(*found, KITTI_CLASSES, tuple(masks) if masks else None)
+    return seen, boxes
 
 
 def rows_of(
@@ -120,7 +178,16 @@ def rows_of(
     chosen += [
         (Variant("localizer", name, {}), LateCascadeFusion(config, make()), left) for name, make in LOCALIZERS.items()
     ]
-    return [row_of(v, fusion, seen, frames, lidar, alone, evaluation, options.samples) for v, fusion, seen in chosen]
+    rows: list[dict[str, Any]] = []
+    made: dict[str, dict[str, Any]] = {}
+    for variant, fusion, seen in chosen:
+        # what the settings at hand are in one group is a row of many others
+        key = "alone" if fusion is None else f"{fusion.config} {type(fusion.localizer).__name__} {seen is left}"
+        if key not in made:
+            samples = options.samples if variant.group in WITH_INTERVALS else 0
+            made[key] = row_of(variant, fusion, seen, frames, lidar, alone, evaluation, samples)
+        rows.append({**made[key], "group": variant.group, "name": variant.name})
+    return rows
 
 
 def row_of(
@@ -143,7 +210,7 @@ def row_of(
             outcomes += np.bincount(fused.outcomes, minlength=len(Outcome))
     truths = [split_truth(frame.labels) for frame in frames if frame.labels is not None]
     shift = evaluate_shift(truths, results, [frame.camera("left") for frame in frames]).metrics
-    gain = evaluation.differences(alone, results, samples) if fusion is not None else {}
+    gain = evaluation.differences(alone, results, samples) if samples and fusion is not None else {}
     return {
         "group": variant.group,
         "name": variant.name,

@@ -58,9 +58,11 @@ def proposals_of(
     detections: Detections2D | None,
     jitter: float,
     seed: int,
+    cut: float,
 ) -> tuple[FrustumProposals, list[int]]:
     """Frustums of a frame, and for each the row of its label in ``objects``."""
-    labelled = np.flatnonzero(np.isin(objects.class_names, KITTI_CLASSES) & objects.has_box3d)
+    known = np.isin(objects.class_names, KITTI_CLASSES) & objects.has_box3d & (objects.truncated >= cut)
+    labelled = np.flatnonzero(known)
     if detections is None:
         truth = detections_2d(objects[labelled], KITTI_CLASSES)
         shift = np.random.default_rng(seed).uniform(-jitter, jitter, (len(truth), 4))
@@ -78,7 +80,14 @@ def proposals_of(
 
 
 def measure(
-    root: Path, split: str, localizer: Localizer, boxes: Path | None, score: float, jitter: float = 0.0, seed: int = 0
+    root: Path,
+    split: str,
+    localizer: Localizer,
+    boxes: Path | None,
+    score: float,
+    jitter: float = 0.0,
+    seed: int = 0,
+    cut: float = 0.0,
 ) -> tuple[list[Row], int, list[float]]:
     """All rows of a split, the number of objects asked for, and the seconds that the localizer took on each frame."""
     rows, asked, seconds = [], 0, []
@@ -93,7 +102,7 @@ def measure(
             results = read_objects(boxes / f"{frame}.txt", results=True)
             detections = detections_2d(results, KITTI_CLASSES)
             detections = detections[detections.scores >= score]
-        proposals, target = proposals_of(points, camera, objects, detections, jitter, seed)
+        proposals, target = proposals_of(points, camera, objects, detections, jitter, seed, cut)
         asked += int(np.isin(objects.class_names, KITTI_CLASSES).sum()) if detections is None else len(target)
         if not len(proposals):
             continue
@@ -176,13 +185,20 @@ def main() -> None:
     parser.add_argument("--boxes", type=Path, help="folder of KITTI result files; default: the labels' 2D boxes")
     parser.add_argument("--score", type=float, default=0.5, help="least score of a 2D detection")
     parser.add_argument("--jitter", type=float, default=0.0, help="move the edges of label boxes by up to this share")
+    parser.add_argument("--cut", type=float, default=0.0, help="labels of which at least this share is cut off only")
     parser.add_argument("--localizer", default="geometric", help="as for lcf3d run")
     parser.add_argument("--json", type=Path, help="write every object's figures to this file")
     parser.add_argument("--each", action="store_true", help="print every object")
     arguments = parser.parse_args()
     localizer = load_localizer(arguments.localizer)
     rows, asked, seconds = measure(
-        arguments.root, arguments.split, localizer, arguments.boxes, arguments.score, arguments.jitter
+        arguments.root,
+        arguments.split,
+        localizer,
+        arguments.boxes,
+        arguments.score,
+        arguments.jitter,
+        cut=arguments.cut,
     )
     if arguments.each:
         for row in rows:

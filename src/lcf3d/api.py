@@ -57,7 +57,8 @@ def run(
     from lcf3d.remote.places import local
     from lcf3d.remote.urls import is_url
     from lcf3d.run.frames import total
-    from lcf3d.run.ray_workers import fuse_frames
+    from lcf3d.run.ray_workers import fuse_frames, require_processes
+    from lcf3d.run.sequences import pending_frames
     from lcf3d.run.setup import RunRequest, prepare_run
 
     folder = local(out, new=True)
@@ -68,9 +69,10 @@ def run(
         request = RunRequest(dataset, lidar, cameras, config=named, **options)
     except TypeError as error:
         raise ConfigError(f"run() does not know that option: {error}") from None
+    require_processes(request, jobs, ray)
     prepared = prepare_run(request, folder, resume=resume, overwrite=overwrite, settings=settings)
-    pending = [frame_id for frame_id in prepared.frame_ids if not prepared.folder.is_done(frame_id)]
-    counts = total(list(fuse_frames(prepared, pending, jobs, ray)))
+    pending, sequences = pending_frames(prepared)
+    counts = total(list(fuse_frames(prepared, pending, jobs, ray, sequences)))
     prepared.folder.finish(prepared.frame_ids)
     warnings = prepared.warnings()
     for sentence in warnings:
@@ -110,7 +112,8 @@ def evaluate(
     """
     from lcf3d.datasets.base import require_missing
     from lcf3d.datasets.opening import open_dataset
-    from lcf3d.evaluation.protocol import EvaluationOptions, open_evaluation
+    from lcf3d.evaluation.opening import open_evaluation
+    from lcf3d.evaluation.protocol import EvaluationOptions
     from lcf3d.remote.places import local
     from lcf3d.run.conversion import as_files
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from math import isnan
 from typing import Any
 
@@ -60,8 +61,10 @@ class Decisions:
     def blank(cls, n: int) -> Decisions:
         """``n`` rows of dropped inputs, all else unset; the fusion fills its columns."""
         # one block a type: a table is made for every frame
-        whole, real = np.full((len(WHOLE) + 2, n), -1, dtype=np.int64), np.full((len(REAL), n), np.nan)
-        whole[0], whole[1] = Outcome.DROPPED, Reason.LOW_SCORE
+        whole, real = np.empty((len(WHOLE) + 2, n), dtype=np.int64), np.empty((len(REAL), n))
+        whole.fill(-1)
+        real.fill(np.nan)
+        whole[0], whole[1] = Outcome.DROPPED.value, Reason.LOW_SCORE.value
         columns: dict[str, Any] = dict(zip(("outcome", "reason", *WHOLE, *REAL), (*whole, *real), strict=True))
         return cls(**columns)
 
@@ -209,16 +212,22 @@ class FusedDetections:
             table.output = place[table.output]
         return replace(self, detections=detections, lidar=tables[0], camera=tables[1], tracks=tracks)
 
-    @property
+    @cached_property
     def outcomes(self) -> IntArray:
         """(N,) `Outcome` of every output."""
-        outcomes = np.full(len(self.detections), Outcome.KEPT, dtype=np.int64)
-        for table in (self.camera, self.lidar):
-            led = table.output >= 0
-            outcomes[table.output[led]] = table.outcome[led]
+        outcomes = self.of_outputs("outcome", Outcome.KEPT.value)
         if self.tracks is not None:
             outcomes[self.tracks.predicted] = Outcome.PREDICTED
+        outcomes.setflags(write=False)
         return outcomes
+
+    def of_outputs(self, name: str, otherwise: int) -> IntArray:
+        """(N,) a column of the decisions by output, ``otherwise`` where no input led to one."""
+        values = np.full(len(self.detections), otherwise)
+        for table in (self.camera, self.lidar):
+            led = (table.output >= 0).nonzero()[0]
+            values[table.output[led]] = getattr(table, name)[led]
+        return values
 
     @property
     def origins(self) -> list[str]:
@@ -232,8 +241,10 @@ class FusedDetections:
     @property
     def dropped_lidar(self) -> IntArray:
         """Indices of the LiDAR detections that were dropped, without those that another box of theirs represents."""
-        merged = (self.lidar.reason == Reason.IN_CLUSTER) | (self.lidar.reason == Reason.SUPPRESSED)
-        return np.flatnonzero((self.lidar.outcome == Outcome.DROPPED) & ~merged)
+        reason = self.lidar.reason
+        merged = (reason == Reason.IN_CLUSTER.value) | (reason == Reason.SUPPRESSED.value)
+        dropped: IntArray = ((self.lidar.outcome == Outcome.DROPPED.value) & ~merged).nonzero()[0]
+        return dropped
 
     def explain(self, output: int) -> str:
         """One sentence on why output ``output`` is there, with the numbers that decided."""

@@ -346,15 +346,24 @@ def _trusted(kind: type[Detections], **columns: Any) -> Detections:
     """Detections of arrays that are known to be right, see `Detections3D.trusted`."""
     made = object.__new__(kind)
     made.__dict__.update(columns)
-    for column in made.__dict__.values():
-        if isinstance(column, np.ndarray):
-            column.setflags(write=False)
+    _freeze(columns)
     return made
+
+
+def _freeze(columns: dict[str, Any]) -> None:
+    """Make arrays read-only."""
+    for column in columns.values():
+        if type(column) is np.ndarray:
+            column.setflags(write=False)
 
 
 def with_columns(detections: Detections, **columns: Any) -> Detections:
     """The same detections with other columns, as many and of the same types; they become read-only, not copied."""
-    return _trusted(type(detections), **{**detections.__dict__, **columns})
+    made = object.__new__(type(detections))
+    made.__dict__.update(detections.__dict__)
+    made.__dict__.update(columns)
+    _freeze(columns)
+    return made
 
 
 def _validate(detections: Detections2D | Detections3D, box_shape: tuple[int | None, int]) -> None:

@@ -64,6 +64,7 @@ def train(*arguments: object) -> None:
 @pytest.mark.parametrize("network", ["lidar", "camera"])
 def test_a_detectors_options(network: str, seen: Seen, tmp_path: Path) -> None:
     options = ("--samples-seed", 77, "--learning-rate", 0.5, "--checkpoint-every", 9, "--workers", 3, "--threads", 5)
+    (tmp_path / "last.pt").touch()
     start = ("--init", tmp_path / "last.pt", "--device", "cuda:1")
     train(network, *options, *start, "--samples", tmp_path, "--out", tmp_path / "out")
     settings = seen.training["settings"]
@@ -79,7 +80,22 @@ def test_scans_are_tilted_by_degrees(seen: Seen, tmp_path: Path) -> None:
 
 
 def test_the_localizers_options(seen: Seen, tmp_path: Path) -> None:
+    (tmp_path / "last.pt").touch()
     start = ("--init", tmp_path / "last.pt", "--device", "cuda:1")
     train("localizer", "--learning-rate", 0.5, *start, "--samples", tmp_path, "--out", tmp_path / "out")
     assert seen.training["settings"].learning_rate == 0.5
     assert (seen.training["init"], seen.training["device"]) == (tmp_path / "last.pt", "cuda:1")
+
+
+@pytest.mark.parametrize("network", ["lidar", "camera", "localizer"])
+def test_what_cannot_begin_is_told_before_anything_is_simulated(network: str, seen: Seen, tmp_path: Path) -> None:
+    def told(*options: object) -> str:
+        result = CliRunner().invoke(app, ["train", network, *map(str, options)])
+        assert result.exit_code in (1, 2)
+        assert not seen.training
+        assert seen.recipe is None
+        return f"{result.exception} {result.output}"
+
+    assert "does not exist" in told("--init", tmp_path / "absent.pt", "--out", tmp_path / "new")
+    (tmp_path / "last.pt").touch()
+    assert "holds a training already" in told("--out", tmp_path)

@@ -10,11 +10,13 @@ from typer.testing import CliRunner
 
 from lcf3d.cli.app import app
 from lcf3d.datasets.kitti import KittiDataset
+from lcf3d.datasets.opening import open_dataset
 from lcf3d.errors import ConfigError, DatasetError
 from lcf3d.fusion.config import FusionConfig
 from lcf3d.provenance import Decisions, FusedDetections
 from lcf3d.reasons import Outcome, Reason
 from lcf3d.run.folder import RunFolder
+from lcf3d.run.table_folder import open_run_folder
 from lcf3d.structures import KITTI_CLASSES, Detections2D, Detections3D
 from lcf3d.visualization.scene import COLOURS
 
@@ -91,6 +93,23 @@ def test_chosen_frames_and_limit(run_folder: Path, tmp_path: Path) -> None:
     assert pixels_of(tmp_path / "a.png", "matched") > 100
     view(run_folder, "--limit", "1", "--out", tmp_path / "some")
     assert [p.name for p in (tmp_path / "some").iterdir()] == ["000001.png"]
+
+
+def test_of_a_long_run_the_first_frames_are_drawn(kitti: Path, run_folder: Path, tmp_path: Path) -> None:
+    from inspect import signature
+
+    from lcf3d.cli.view import _frame_ids
+    from lcf3d.cli.view import view as verb
+
+    assert signature(verb).parameters["limit"].default == 50
+    data = open_dataset(f"kitti:{kitti}")
+    ids = open_run_folder(run_folder).frame_ids()
+    assert len(ids) > 1
+    assert _frame_ids(data, [], run_folder, 1) == (ids[:1], len(ids) - 1)
+    assert _frame_ids(data, [], run_folder, 0) == (ids, 0)
+    # those that are named are drawn, however many
+    assert _frame_ids(data, ids, run_folder, 1) == (ids, 0)
+    assert f"{len(ids)} pictures in" in view(run_folder, "--limit", "0", "--out", tmp_path / "all")
 
 
 def test_a_dataset_with_the_results_of_a_run(kitti: Path, run_folder: Path, tmp_path: Path) -> None:

@@ -339,6 +339,11 @@ def test_an_export_comes_back(root, tmp_path):
             lambda v: v["cameras"]["front"].update(distortion={"model": "fisheye", "coefficients": [0.1], "k": 1}),
             "unknown key 'cameras.front.distortion.k'; the keys there are model, coefficients",
         ),
+        (
+            lambda v: v["cameras"]["front"].update(distortion=[0.1, 0.2]),
+            "cameras.front.distortion takes keys (model, coefficients), got [0.1, 0.2]",
+        ),
+        (lambda v: v["cameras"].update(front=3), "cameras.front takes keys (images, intrinsics"),
     ],
 )
 def test_one_sentence_for_a_sensors_file_that_is_wrong(root, change, message):
@@ -349,7 +354,16 @@ def test_one_sentence_for_a_sensors_file_that_is_wrong(root, change, message):
     assert "\n" not in str(error.value)
 
 
+def test_a_scan_that_is_cut_off_is_told_once(root):
+    scan = next(path for path in sorted((root / "scans").iterdir()) if path.suffix == ".bin")
+    scan.write_bytes(scan.read_bytes()[:-3])
+    (told,) = findings(root, "FRM01")
+    assert "is cut off" in told.message
+
+
 def test_folders_that_are_not_there(root, tmp_path):
+    with pytest.raises(DatasetError, match=r"sensors.yaml is a file; name the folder"):
+        FolderDataset(root / "sensors.yaml")
     with pytest.raises(DatasetError, match="lcf3d init"):
         FolderDataset(tmp_path)
     write_sensors(root, lambda v: v["cameras"]["front"].update(images="nowhere"))

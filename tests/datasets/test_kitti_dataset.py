@@ -46,17 +46,16 @@ def test_calibrations_of_one_text_are_one_until_a_file_changes(root):
     assert dataset.frame("000000").cameras[0].projection[0, 0] == P2[0][0]
 
 
-def test_range_of_scores_without_a_look_at_frames(root):
+def test_files_without_lines_and_without_boxes(root):
     lidar, camera = make_results(root)
     write_objects(lidar / "000001.txt", KittiObjects.empty(results=True))
     dataset = KittiDataset(root)
     source = dataset.lidar_results(lidar, ("Car",))
-    assert source.score_range(["000001"]) == (0, 0)
-    assert source.score_range(dataset.ids) == (0, 0.9)
+    assert not len(source.detect(dataset.frame("000001")))
     assert source.detect(dataset.frame("000000")).scores.tolist() == [0.9, 0.8]
     assert dataset.lidar_results(lidar, ("Pedestrian",), "empty").class_names == ("Pedestrian",)
     with pytest.raises(Lcf3dError, match="holds no 3D boxes"):
-        dataset.lidar_results(camera, ("Car",)).score_range(dataset.ids)
+        dataset.lidar_results(camera, ("Car",)).detect(dataset.frame("000000"))
 
 
 def test_all_frames_without_a_split(root):

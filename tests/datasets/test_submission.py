@@ -38,6 +38,16 @@ def test_what_kittis_server_would_refuse_is_refused_here(tmp_path):
         kitti_zip(write(tmp_path / "b", frames, "Van"), tmp_path / "x.zip", frames)
     with pytest.raises(FormatError, match=r"000000.txt: 2 boxes have no area"):
         kitti_zip(write(tmp_path / "c", frames, x2=100), tmp_path / "x.zip", frames)
+    with pytest.raises(DatasetError, match=r"1 files that are of no test frame, first 000001\.txt"):
+        kitti_zip(tmp_path / "b", tmp_path / "x.zip", frames[:1])
+    with pytest.raises(DatasetError, match="nowhere is not a folder"):
+        kitti_zip(tmp_path / "nowhere", tmp_path / "x.zip", frames)
+    (tmp_path / "d" / "detections").mkdir(parents=True)
+    (tmp_path / "d" / "detections" / "part.parquet").touch()
+    with pytest.raises(DatasetError, match="holds parquet files; the server takes text"):
+        kitti_zip(tmp_path / "d", tmp_path / "x.zip", frames)
+    with pytest.raises(ConfigError, match="is a folder; --out names the file"):
+        write_submission_file("kitti:x", None, tmp_path / "b", tmp_path)
     assert not (tmp_path / "x.zip").exists()
     assert len(KITTI_TEST_FRAMES) == 7518
 
@@ -70,6 +80,34 @@ def test_a_nuscenes_submission_has_all_samples_and_all_flags(tmp_path):
     path.write_text(json.dumps({"meta": {**meta, "use_map": "no"}, "results": {token: [] for token in tokens}}))
     with pytest.raises(FormatError, match="true or false for use_map"):
         nuscenes_json(path, tokens, tmp_path / "out.json", expected=2)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"detection_name": "tram"}, "tram"),
+        ({"attribute_name": "vehicle.flying"}, "vehicle.flying"),
+        ({"size": [0.0, 4.0, 1.5]}, "size"),
+        ({"detection_score": float("nan")}, "detection_score"),
+        ({"translation": [1.0, 2.0]}, "translation"),
+        ({"rotation": [0.0, 0.0, 0.0, 0.0]}, "rotation"),
+    ],
+)
+def test_boxes_that_nuscenes_would_refuse_are_refused_here(tmp_path, change, message):
+    path = tmp_path / "results.json"
+    meta = dict.fromkeys(META_KEYS, True)
+    path.write_text(json.dumps({"meta": meta, "results": {"a" * 32: [{**box("a" * 32), **change}]}}))
+    with pytest.raises(FormatError, match=message):
+        nuscenes_json(path, ("a" * 32,), tmp_path / "out.json", expected=1)
+    assert not (tmp_path / "out.json").exists()
+
+
+def test_501_boxes_are_too_many_for_nuscenes(tmp_path):
+    path = tmp_path / "results.json"
+    meta = dict.fromkeys(META_KEYS, True)
+    path.write_text(json.dumps({"meta": meta, "results": {"a" * 32: [box("a" * 32)] * 501}}))
+    with pytest.raises(FormatError, match="500"):
+        nuscenes_json(path, ("a" * 32,), tmp_path / "out.json", expected=1)
 
 
 def test_other_datasets_have_no_server_here(tmp_path):

@@ -7,7 +7,8 @@ import pytest
 from lcf3d.datasets.argoverse2 import Argoverse2Dataset
 from lcf3d.errors import ConfigError, DatasetError
 from lcf3d.evaluation.argoverse_task import ArgoverseEvaluation
-from lcf3d.evaluation.protocol import EvaluationOptions, open_evaluation
+from lcf3d.evaluation.opening import open_evaluation
+from lcf3d.evaluation.protocol import EvaluationOptions
 from tests.datasets.argoverse_log import LOG, cuboid, sweep_time, write_log, write_submission_rows
 
 pytest.importorskip("pyarrow", reason="needs pyarrow (extra formats)")

@@ -68,6 +68,46 @@ def test_other_frames_only(study, calibration):
     assert half.lidar["Car"] != calibration.lidar["Car"]
 
 
+@pytest.fixture(scope="module")
+def doubled(tmp_path_factory):
+    """The same detections as a LiDAR branch without suppression writes them: each box three times more, less sure."""
+    root = tmp_path_factory.mktemp("doubled")
+    lidar, camera = write_drive(root, 60)
+    for path in lidar.glob("*.txt"):
+        lines = [line.split() for line in path.read_text().splitlines()]
+        more = [
+            " ".join([*f[:11], f"{float(f[11]) + 0.02 * k:.3f}", *f[12:15], f"{float(f[15]) - 0.3 * k:.4f}"])
+            for k in range(1, 4)
+            for f in lines
+        ]
+        path.write_text(path.read_text() + "\n".join(more) + "\n")
+    request = RunRequest(f"kitti:{root}", f"results:{lidar}", {"*": f"results:{camera}"}, "val", config="kitti")
+    return open_study(request, folds=3)
+
+
+def test_boxes_from_before_suppression_do_not_count_as_wrong(study, calibration, doubled):
+    # the fusion passes one box a cluster on, so that is what has to be right
+    assert (study.doubles, doubled.doubles) == (0, 3 * 60 * 7)
+    assert doubled.lidar.judged.sum() == study.lidar.judged.sum()
+    assert doubled.lidar.right.sum() == study.lidar.right.sum()
+    fitted = doubled.fit()
+    assert (fitted.lidar, fitted.ground_z) == (calibration.lidar, calibration.ground_z)
+    # a cluster overlaps a 2D box as much as its best member does, which hardly moves the evidence
+    np.testing.assert_allclose(fitted.evidence["Car"].weights, calibration.evidence["Car"].weights, atol=0.1)
+    for one, other in zip(study.cross_validate(calibration), doubled.cross_validate(calibration), strict=True):
+        assert one.lidar_count == other.lidar_count
+        assert one.log_loss_fused == pytest.approx(other.log_loss_fused, abs=0.01, nan_ok=True)
+        assert one.before == pytest.approx(other.before)
+        assert one.after == pytest.approx(other.after, abs=0.2)
+
+
+def test_the_command_tells_of_doubles(doubled, calibration, study):
+    from lcf3d.cli.calibrate import calibration_table
+
+    assert any("1,260 of 1,680 LiDAR boxes double a surer one" in n for n in calibration_table(doubled, calibration)[3])
+    assert not any("double" in note for note in calibration_table(study, calibration)[3])
+
+
 def test_results_without_3d_boxes_are_refused(study):
     empty = [Detections3D.empty(CONFIG.class_names)] * 60
     with pytest.raises(Lcf3dError, match="no 3D boxes"):

@@ -3,7 +3,7 @@ import socket
 import pytest
 
 from lcf3d.errors import ConfigError
-from lcf3d.evaluation.server import HOST, report_app, serve
+from lcf3d.evaluation.server import HOST, listen, report_app
 
 from .test_report import Calibrated, data_of, result_set
 
@@ -47,9 +47,19 @@ def test_other_names_of_this_machine_are_refused(client) -> None:
     assert client.get("/", headers={"host": "elsewhere.example"}).status_code == 400
 
 
-def test_a_port_in_use_is_said() -> None:
+def test_a_port_in_use_is_said_before_anything_is_read(refused_by) -> None:
     with socket.socket() as taken:
         taken.bind((HOST, 0))
         taken.listen()
+        port = taken.getsockname()[1]
         with pytest.raises(ConfigError, match="cannot be used"):
-            serve(None, taken.getsockname()[1])
+            listen(port)
+        said = refused_by("serve", "nowhere", "--port", port)
+    assert said == f"error: port {port} of {HOST} cannot be used (Address already in use); pass another --port"
+
+
+def test_any_free_port_is_one_that_can_be_named() -> None:
+    with listen(0) as first, listen(0) as second:
+        ports = {one.getsockname()[1] for one in (first, second)}
+    assert len(ports) == 2
+    assert 0 not in ports

@@ -1,6 +1,10 @@
 """Tables made column by column against the same tables made row by row from what `to_json` gives."""
 
-from dataclasses import fields
+import os
+import subprocess
+import sys
+import tempfile
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -100,3 +104,31 @@ def test_outputs_column_by_column_are_those_row_by_row(frames):
             )
     expected = pyarrow.Table.from_pylist(rows, schema=detection_schema())
     assert detection_table(frames, detection_schema()).equals(expected, check_metadata=True)
+
+
+def test_boxes_that_are_not_finite_stay_what_they_are():
+    frame = made_up(3, 1, ("Car",), 1, more=False)
+    boxes = frame.lidar_inputs.boxes.copy()
+    boxes[-1, 2] = np.nan
+    inputs = Detections3D(boxes, frame.lidar_inputs.scores, frame.lidar_inputs.labels, ("Car",))
+    found = frame_table([("a", replace(frame, lidar_inputs=inputs))], frame_schema()).to_pylist()
+    np.testing.assert_array_equal(found[0]["lidar_inputs"]["boxes"], boxes)
+
+
+def test_columns_are_made_without_pandas():
+    program = f"""
+import sys
+import lcf3d.formats.fused_table as tables
+from formats.test_fused_columns import FRAMES
+from pathlib import Path
+tables.write_frames(Path(sys.argv[1]) / "a.parquet", FRAMES)
+tables.write_detections(Path(sys.argv[1]) / "b.parquet", FRAMES)
+assert len(list(tables.read_frames(Path(sys.argv[1]) / "a.parquet"))) == {len(FRAMES)}
+print("pandas" in sys.modules)
+"""
+    env = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    with tempfile.TemporaryDirectory() as folder:
+        done = subprocess.run(
+            [sys.executable, "-c", program, folder], env=env, stdout=subprocess.PIPE, text=True, check=True
+        )
+    assert done.stdout.split() == ["False"]

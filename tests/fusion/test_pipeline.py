@@ -179,18 +179,37 @@ def test_recovered_double_of_a_confirmed_box():
     assert len(fused) == 1
 
 
-def test_recovered_box_replaces_an_unconfirmed_one():
+@pytest.mark.parametrize(
+    ("score", "reasons"), [(0.4, ("replaced", "localized")), (0.98, ("downweighted", "duplicate"))]
+)
+def test_of_a_recovered_box_and_an_unconfirmed_one_on_one_spot_the_higher_score_stays(score, reasons):
     shifted = car(13.0, 2.3)  # too far off to match at 0.9, but on the same spot
     fused = fuse(
-        lidar([shifted], [0.4]),
+        lidar([shifted], [score]),
         {"left": seen(camera(), [NEAR], [0.9])},
         surface_points([NEAR]),
         [NEAR],
         match_iou=0.9,
         unmatched="downweight",
     )
-    assert fused.lidar.row(0)["reason"] == "replaced"
-    assert fused.outcomes.tolist() == [Outcome.RECOVERED]
+    assert (fused.lidar.row(0)["reason"], fused.camera.row(0)["reason"]) == reasons
+    assert fused.outcomes.tolist() == [Outcome.RECOVERED if score < 0.5 else Outcome.KEPT]
+
+
+def test_a_recovered_box_that_gives_way_takes_no_other_place():
+    # it overlaps two unconfirmed boxes, of which one is surer than it
+    sure, unsure = car(13.0, 2.3), car(11.0, 1.7)
+    fused = fuse(
+        lidar([sure, unsure], [0.98, 0.2]),
+        {"left": seen(camera(), [NEAR], [0.9])},
+        surface_points([NEAR]),
+        [NEAR],
+        match_iou=0.95,
+        cluster_iou=0.9,
+        unmatched="downweight",
+    )
+    assert [fused.lidar.row(i)["reason"] for i in range(2)] == ["downweighted", "downweighted"]
+    assert fused.camera.row(0)["reason"] == "duplicate"
 
 
 def two_cameras():

@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lcf3d.geometry.boxes import bev_corners, wrap_angle
-from lcf3d.geometry.iou import bev_iou, image_area, image_iou, iou_3d
+from lcf3d.geometry.iou import bev_iou, image_area, image_cover, image_iou, iou_3d
 
 length = st.floats(0.1, 15)
 box = st.tuples(st.floats(-5, 5), st.floats(-5, 5), st.floats(-2, 2), length, length, length, st.floats(-7, 7)).map(
@@ -123,6 +123,13 @@ def test_image_iou_by_hand():
     b = np.array([[5.0, 0, 15, 10], [0, 0, 10, 10]])
     np.testing.assert_allclose(image_iou(a, b), [[1 / 3, 1], [0, 0], [0, 0]])
     assert image_area(np.array([[3.0, 3, 1, 9]]))[0] == 0
+
+
+def test_the_share_of_a_box_in_another_by_hand():
+    a = np.array([[0.0, 0, 10, 10], [2, 2, 4, 4], [5, 5, 5, 5]])
+    b = np.array([[5.0, 0, 15, 10], [-100, -100, 100, 100]])
+    np.testing.assert_allclose(image_cover(a, b), [[0.5, 1], [0, 1], [0, 0]])
+    assert image_cover(a, np.zeros((0, 4))).shape == (3, 0)
 
 
 def test_empty_inputs_give_empty_matrices():

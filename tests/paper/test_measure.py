@@ -136,6 +136,59 @@ def test_the_command_prints_and_writes(tmp_path, drive):
     assert (tmp_path / "table-2.json").is_file()
 
 
+def test_a_rehearsal_in_which_a_row_fails_has_failed(tmp_path, drive):
+    (tmp_path / "cut.pth").write_bytes(b"PK half a file")
+    command = ["paper", "table-1", "--kitti", str(drive[0]), "--out", str(tmp_path), "--row", "SECOND", "--json"]
+    command += ["--use", f"second-kitti={tmp_path / 'cut.pth'}"]
+    assert CliRunner().invoke(app, command).exit_code == 0
+    result = CliRunner().invoke(app, [*command, "--rehearse"])
+    assert result.exit_code == 1
+    assert "1 rows did not run, first table-1: SECOND" in result.output
+
+
+def test_what_is_absent_is_told_with_disk_and_hours(tmp_path):
+    result = CliRunner().invoke(app, ["paper", "table-1", "--out", str(tmp_path), "--json"])
+    assert result.exit_code == 0, result.output
+    rows = {row["name"]: row["notes"] for row in json.loads(result.output)["rows"]}
+    fused = rows["PV-RCNN + Faster R-CNN, stereo"]
+    assert [note.split(" ")[:2] for note in fused] == [
+        ["needs", "fasterrcnn-r101-kitti"],
+        ["needs", "frustum-pointnet-kitti"],
+        ["needs", "--kitti"],
+        ["about", fused[-1].split(" ")[1]],
+    ]
+    assert "29 GB" in fused[2]
+    # a network runs once for all rows: five networks on 3,769 frames, the images of both views
+    hours = 3769 * (0.40 + 0.96 + 1.99 + 2.55 + 2 * 2.6) / 3600
+    assert fused[3].startswith(f"about {hours:.1f} h on two CPU cores")
+    assert rows["SECOND"][-1] == fused[-1]
+
+
+def test_a_folder_without_a_list_has_to_hold_the_papers_frames(tmp_path, drive):
+    import shutil
+
+    root = tmp_path / "kitti"
+    shutil.copytree(drive[0], root)
+    (root / "ImageSets" / "val.txt").unlink()
+    table = find_table("table-1")
+    with pytest.raises(ConfigError, match=r"lacks 3,761 of the 3,769 frames .*ImageSets/val\.txt"):
+        measure_row(table, table.rows[3], place(tmp_path, (root, *drive[1:])))
+
+
+def test_mvxnet_looks_through_the_front_camera_of_the_other_dataset(tmp_path, monkeypatch):
+    from lcf3d.paper import shift
+
+    tasks = []
+    monkeypatch.setattr(shift, "_measure", lambda task, row, place: tasks.append(task) or {"figures": {}, "frames": 1})
+    here = Workplace(tmp_path, {"kitti": tmp_path, "nuscenes": tmp_path})
+    for name in ("kitti -> nuscenes: MVXNet", "kitti -> kitti: MVXNet"):
+        measure_row(find_table("table-7"), find_row(find_table("table-7"), name), here)
+    assert [task.lidar for task in tasks] == [
+        "mvxnet:mvxnet-kitti?nms=keep&camera=CAM_FRONT",
+        "mvxnet:mvxnet-kitti?nms=keep",
+    ]
+
+
 def test_the_split_lists_are_written(tmp_path):
     result = CliRunner().invoke(app, ["paper", "splits", "--out", str(tmp_path)])
     assert result.exit_code == 0, result.output
@@ -147,7 +200,10 @@ def test_wrong_requests_are_refused():
     for arguments, message in (
         (["table-1", "--results", "SECOND"], "--results takes NAME=DIR"),
         (["table-5", "--results", "LCF3D=."], "takes no --results"),
-        (["all", "--row", "SECOND"], "are for one table"),
+        (["all", "--row", "VoxelNeXt"], "no table has a row 'VoxelNeXt'"),
+        (["table-1", "--row", "VoxelNeXt"], "names 0 rows of table-1"),
+        (["all", "--row", "MVXNet", "--results", "MVXNet=."], "--results is for one table"),
+        (["table-1", "--kitti", "nowhere"], "--kitti nowhere: there is no such folder"),
     ):
         result = CliRunner().invoke(app, ["paper", *arguments])
         assert isinstance(result.exception, ConfigError)

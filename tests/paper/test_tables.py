@@ -9,7 +9,7 @@ from lcf3d.paper.estimates import about
 from lcf3d.paper.networks import NeedsError, branches, parse_uses, spec_of
 from lcf3d.paper.report import markdown, table_data, to_json
 from lcf3d.paper.splits import KITTI_TRAIN, KITTI_VAL
-from lcf3d.paper.tables import find_row, find_table, paper_tables
+from lcf3d.paper.tables import find_row, find_rows, find_table, paper_tables
 from lcf3d.paper.workplace import Measured
 
 
@@ -65,6 +65,18 @@ def test_a_row_is_found_by_the_beginning_of_its_name():
         find_table("table-9")
 
 
+def test_rows_are_found_in_all_tables_that_have_them():
+    found = find_rows(list(paper_tables().values()), ["PointPillars", "LCF3D*"])
+    assert [(table.name, [row.name for row in rows]) for table, rows in found if table.name != "table-4"] == [
+        ("table-1", ["PointPillars"]),
+        ("table-3", ["PointPillars"]),
+        ("figure-1", ["LCF3D*"]),
+    ]
+    assert sum(len(rows) for _, rows in find_rows(list(paper_tables().values()), [])) > 70
+    with pytest.raises(ConfigError, match="no table has a row"):
+        find_rows(list(paper_tables().values()), ["PointRCNN"])
+
+
 def test_networks_without_an_address_are_asked_for():
     assert spec_of("pointpillars-kitti", "lidar", {}) == "pointpillars:pointpillars-kitti"
     with pytest.raises(NeedsError, match="--use fasterrcnn-r101-kitti=FILE"):
@@ -81,6 +93,9 @@ def test_a_file_or_another_detector_stands_for_a_network(tmp_path):
     assert branches(row, {"pointpillars-kitti": str(weights)}) == (f"pointpillars:{weights}?nms=keep", "", "geometric")
     assert branches(row, {}, "cuda")[0] == "pointpillars:pointpillars-kitti?device=cuda&nms=keep"
     assert branches(row, {"pointpillars-kitti": "results:DIR"})[0] == "results:DIR"
+    # no suppression of its own, so no setting for it
+    fusion = find_row(find_table("table-7"), "nuscenes -> kitti: BEVFusion")
+    assert branches(fusion, {})[0] == "bevfusion:bevfusion-nuscenes"
     with pytest.raises(ConfigError, match="no such file"):
         spec_of("pointpillars-kitti", "lidar", {"pointpillars-kitti": "gone.pth"})
     with pytest.raises(ConfigError, match="--use takes"):

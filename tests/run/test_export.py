@@ -186,7 +186,7 @@ def test_a_run_that_moved_away_from_its_dataset(root: Path, tmp_path: Path, refu
     data = json.loads((moved / "run.json").read_text())
     (moved / "run.json").write_text(json.dumps({**data, "dataset": f"kitti:{tmp_path / 'gone'}"}))
     gone = f"dataset folder {tmp_path / 'gone'} does not exist"
-    for command in (("export", moved, "--to", "coco", "--out", tmp_path / "x.json"), ("serve", moved)):
+    for command in (("export", moved, "--to", "coco", "--out", tmp_path / "x.json"), ("serve", moved, "--port", 0)):
         assert refused_by(*command) == f"error: the dataset of this run is not there ({gone}); name it with --dataset"
     said = refused_by("view", moved)
     assert said.startswith(f"error: the dataset of this run is not there ({gone})")

@@ -188,6 +188,7 @@ def test_what_is_wrong_with_shards_is_named(root: Path, tmp_path: Path) -> None:
         ([one, fused(root, tmp_path / "again", shard="1/3")], "shard 1/3 is there twice, in .*s1 and .*again"),
         ([one, fused(root, tmp_path / "o", shard="2/3", recovery="off")], "different runs: they differ in"),
         ([], "no shards"),
+        ([one, tmp_path], "is no folder of 'lcf3d run'"),
     ):
         with pytest.raises(ConfigError, match=message):
             merge_shards(shards, tmp_path / "merged")

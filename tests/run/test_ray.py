@@ -2,7 +2,6 @@
 
 import os
 import signal
-import subprocess
 import sys
 from collections import Counter
 from collections.abc import Iterator
@@ -11,6 +10,8 @@ from pathlib import Path
 import pytest
 
 import lcf3d
+from lcf3d.datasets import kitti_results
+from lcf3d.detectors.joins import LeftOut
 from lcf3d.errors import ConfigError, Lcf3dError, MissingExtraError
 from lcf3d.run import ray_workers
 from lcf3d.run.folder import RunFolder
@@ -39,8 +40,9 @@ def cluster() -> Iterator[str]:
 
     os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
     try:
-        started = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
-        started.add_node(num_cpus=1)
+        node = {"num_cpus": 1, "object_store_memory": 100 * 2**20, "include_log_monitor": False}
+        started = Cluster(initialize_head=True, head_node_args={**node, "include_dashboard": False})
+        started.add_node(**node)
     except (Exception, SystemExit) as error:
         pytest.skip(f"Ray's own servers did not start on this machine in time: {error!r}")
     yield started.address
@@ -58,29 +60,37 @@ def fused(root: Path, out: Path, **options) -> dict:
     return lcf3d.run(asked.dataset, asked.lidar, asked.cameras, out, **options)
 
 
-@pytest.mark.parametrize("form", ["folder", "parquet"])
+def test_a_cluster_that_is_not_there(root: Path, tmp_path: Path, refused_by) -> None:
+    # before there is one that Ray would already be connected with
+    pytest.importorskip("ray", reason="needs Ray: pip install 'lcf3d[fleet]'")
+    asked = request(root)
+    command = ["run", asked.dataset, "--lidar", asked.lidar, "--camera", asked.cameras["*"], "--out", tmp_path / "out"]
+    said = refused_by(*command, "--ray", "nonsense://x")
+    assert said.startswith("error: the Ray cluster at nonsense://x cannot be used (")
+
+
 def test_a_cluster_gives_the_same_bytes(
-    root: Path, tmp_path: Path, cluster: str, monkeypatch: pytest.MonkeyPatch, form: str
+    root: Path, tmp_path: Path, cluster: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("lcf3d.run.frames.SHARD_FRAMES", 16)
-    one = fused(root, tmp_path / "one", form=form)
-    counts = fused(root, tmp_path / "two", form=form, ray=cluster)
+    one = fused(root, tmp_path / "one", form="parquet")
+    counts = fused(root, tmp_path / "two", form="parquet", ray=cluster)
     assert content(tmp_path / "one", *PARTS) == content(tmp_path / "two", *PARTS)
     assert {k: v for k, v in counts.items() if k not in ("median_ms", "out")} == {
         k: v for k, v in one.items() if k not in ("median_ms", "out")
     }
-    # each of the two nodes had a worker, and what a lost shard held is fused again
-    if form == "parquet":
-        lost = next((tmp_path / "two" / "provenance").iterdir())
-        lost.unlink()
-        assert fused(root, tmp_path / "two", form=form, ray=cluster, resume=True)["already_done"] in (24, 32)
-        assert content(tmp_path / "one", *PARTS) == content(tmp_path / "two", *PARTS)
+    # what a lost shard held is fused again
+    lost = next((tmp_path / "two" / "provenance").iterdir())
+    lost.unlink()
+    again = fused(root, tmp_path / "two", form="parquet", ray=cluster, resume=True)
+    assert again["already_done"] in (24, 32)
+    assert content(tmp_path / "one", *PARTS) == content(tmp_path / "two", *PARTS)
 
 
 def test_workers_that_are_killed_are_replaced(
     root: Path, tmp_path: Path, cluster: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    fused(root, tmp_path / "one")
+    one = fused(root, tmp_path / "one")
     import ray
 
     pids, killed = [], []
@@ -102,9 +112,11 @@ def test_workers_that_are_killed_are_replaced(
 
     monkeypatch.setattr(ray_workers._Pool, "_start", starting)
     monkeypatch.setattr(RunFolder, "take", taking)
-    fused(root, tmp_path / "two", ray=cluster)
+    two = fused(root, tmp_path / "two", ray=cluster)
     assert killed
-    assert len(pids) > 2
+    # each of the two nodes had a worker, and each that was killed another in its place
+    assert len(pids) == 2 + len(killed)
+    assert one["outputs"] == two["outputs"]
     assert content(tmp_path / "one", *PARTS) == content(tmp_path / "two", *PARTS)
 
 
@@ -117,23 +129,26 @@ def test_shards_that_no_worker_survives(
 
     Dying.__module__ = "__main__"
     monkeypatch.setattr(ray_workers, "ShardWorker", Dying)
-    with pytest.raises(Lcf3dError, match=r"3 Ray workers died on the frames 0000\d\d to 0000\d\d \(.*--resume"):
-        fused(root, tmp_path / "out", ray=cluster)
+    monkeypatch.setattr(ray_workers, "ATTEMPTS", 2)
+    with pytest.raises(Lcf3dError, match=r"2 Ray workers died on the frames 000000 to 000003 \(.*--resume"):
+        fused(root, tmp_path / "out", ray=cluster, frames=IDS[:4])
 
 
 def test_what_is_wrong_on_a_worker_is_said(
     root: Path, tmp_path: Path, cluster: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    prepared = prepare_run(request(root), tmp_path / "out")
+    # one shard, and so one worker
+    ids = IDS[:4]
+    prepared = prepare_run(request(root, frames=ids), tmp_path / "out")
     (root / "kitti").rename(root / "away")
     try:
         with pytest.raises(Lcf3dError, match=r"dataset folder .*kitti does not exist \(on "):
-            list(run_on_ray(prepared, IDS, cluster))
+            list(run_on_ray(prepared, ids, cluster))
     finally:
         (root / "away").rename(root / "kitti")
     monkeypatch.setattr("lcf3d.__version__", "0.0.0")
     with pytest.raises(ConfigError, match=r"a Ray worker has lcf3d .*, this machine 0.0.0"):
-        list(run_on_ray(prepared, IDS, cluster))
+        list(run_on_ray(prepared, ids, cluster))
     prepared.folder.release()
 
 
@@ -150,6 +165,46 @@ def test_a_worker_without_a_cluster(root: Path, tmp_path: Path) -> None:
     prepared.folder.release()
 
 
+def test_a_worker_reads_the_files_of_its_shards_at_once(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    prepared = prepare_run(request(root), tmp_path / "out")
+    prepared.folder.release()
+    worker = ShardWorker(Plan.of(prepared))
+    read: list[tuple[str, ...]] = []
+    read_folder = kitti_results.read_folder
+
+    def noting(folder: Path, frame_ids, **options):
+        read.append(tuple(frame_ids))
+        return read_folder(folder, frame_ids, **options)
+
+    monkeypatch.setattr(kitti_results, "read_folder", noting)
+    # a part must not list the files of all others
+    list_it = os.scandir
+    monkeypatch.setattr(os, "scandir", lambda a=".": pytest.fail("listed") if str(root) in str(a) else list_it(a))
+    summaries, _ = worker.fuse(IDS[4:9])
+    assert len(summaries) == 5
+    assert read == [IDS[4:9], IDS[4:9]]
+
+
+def test_sources_that_add_up_what_others_count_go_to_a_worker_too(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Several:
+        """As a folder of results for each camera."""
+
+        @property
+        def left_out(self) -> LeftOut:
+            return LeftOut("somewhere", taken=3)
+
+    prepared = prepare_run(request(root), tmp_path / "out")
+    prepared.folder.release()
+    plan = Plan.of(prepared)
+    inputs = ray_workers.read_inputs(prepared.request, look=False)
+    monkeypatch.setattr(ray_workers, "read_inputs", lambda *a, **k: inputs._replace(cameras={"left": Several()}))
+    assert plan.runner(tmp_path / "worker").cameras["left"].left_out.taken == 3
+
+
 def test_memory_of_drives_and_ray_do_not_go_together(root: Path, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="takes drives apart"):
         fused(root, tmp_path / "out", memory=True, ray="auto")
@@ -161,21 +216,6 @@ def test_no_ray(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(MissingExtraError, match=r"--ray needs ray; install it with: pip install 'lcf3d\[fleet\]'"):
         fused(root, tmp_path / "out", ray="auto")
-
-
-def test_a_cluster_that_is_not_there(root: Path, tmp_path: Path) -> None:
-    pytest.importorskip("ray", reason="needs Ray: pip install 'lcf3d[fleet]'")
-    asked = request(root)
-    command = ["run", asked.dataset, "--lidar", asked.lidar, "--camera", asked.cameras["*"], "--out", tmp_path / "out"]
-    done = subprocess.run(
-        [sys.executable, "-m", "lcf3d", *map(str, command), "--ray", "nonsense://x"],
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
-    assert done.returncode == 2
-    assert "error: the Ray cluster at nonsense://x cannot be used (" in done.stderr
-    assert "Traceback" not in done.stderr
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ from lcf3d.simulation import benchmark, get_preset, simulate_frame
 from lcf3d.simulation.comparison import (
     RANGE_EDGES,
     compare,
+    height_shares,
     label_statistics,
     median_points,
     scan_statistics,
@@ -48,6 +49,8 @@ def test_statistics_by_hand(tmp_path):
     assert labels.occlusion["Car"].tolist() == [0.5, 0, 0.5, 0]
     np.testing.assert_allclose(labels.sizes["Car"], [[4, 2, 2], [4, 2, 2]])
     np.testing.assert_allclose(sorted(labels.distances["Car"]), [10, 30])
+    assert labels.heights["Car"].tolist() == [10, 10]
+    assert height_shares(labels)["Car"].tolist() == [1, 0, 0, 0]  # lower than 25 pixels
 
 
 def test_median_points_need_two_objects_in_a_class():

@@ -3,6 +3,7 @@ import pytest
 
 from lcf3d.errors import ConfigError
 from lcf3d.formats.kitti import detections_3d
+from lcf3d.geometry.camera import project_boxes
 from lcf3d.geometry.iou import image_iou
 from lcf3d.simulation.frames import attribute, simulate_frame
 from lcf3d.simulation.labels import occlusion_level
@@ -29,13 +30,26 @@ def test_kitti_labels_give_back_the_boxes(frames):
 def test_clear_labels_have_boxes_that_fit_the_projection(frames):
     for frame in frames:
         objects, camera = frame.kitti, frame.preset.cameras[0]
-        from lcf3d.geometry.camera import project_boxes
-
         clear = (objects.occluded == 0) & (objects.truncated == 0) & (objects.class_names == "Car")
         boxes = detections_3d(objects[clear], camera.camera_from_lidar, ("Car",)).boxes
         projected, _ = project_boxes(boxes, camera)
         if len(boxes):
             assert np.diag(image_iou(projected, objects.boxes2d[clear])).min() > 0.55
+
+
+def test_boxes_of_people_are_narrower_than_their_projection_and_those_of_cars_are_not(frames):
+    shares = {"pedestrian": [], "car": []}
+    for frame in frames:
+        camera = frame.preset.cameras[0]
+        projected, seen = project_boxes(frame.boxes, camera)
+        for k in np.flatnonzero(seen):
+            kind, box = frame.actors[k].kind, frame.sightings["left"].amodal[k]
+            whole = (projected[k, 0] > 0) & (projected[k, 2] < camera.width)
+            if kind in shares and whole:
+                shares[kind].append((box[2] - box[0]) / (projected[k, 2] - projected[k, 0]))
+                np.testing.assert_allclose(box[[1, 3]], projected[k, [1, 3]])
+    assert 0.5 < np.median(shares["pedestrian"]) < 0.85  # 0.68 in KITTI
+    assert np.min(shares["car"]) == 1
 
 
 def test_hidden_and_truncated_shares_follow_from_a_wall_and_an_image_border(frames):

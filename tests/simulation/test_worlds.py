@@ -185,13 +185,14 @@ def test_training_scans_differ_from_plain_ones_in_intensity_only_where_asked():
     assert (a[:, 3] == 0).mean() > (b[:, 3] == 0).mean() + 0.02
 
 
-@pytest.mark.parametrize(("frames", "val"), [(1, 0), (2, 1), (4, 1), (5, 1), (9, 1), (10, 2)])
+@pytest.mark.parametrize(("frames", "val"), [(1, 1), (2, 1), (4, 1), (5, 1), (9, 1), (10, 2)])
 def test_small_sets_have_a_validation_frame(tmp_path, frames, val):
     ids = [f"{k:06d}" for k in range(frames)]
     write_splits(tmp_path, ids, 1)
     train, held = ((tmp_path / "ImageSets" / f"{s}.txt").read_text().split() for s in ("train", "val"))
     assert len(held) == val
-    assert sorted(train + held) == ids
+    assert sorted({*train, *held}) == ids
+    assert len(train) == max(1, frames - val)
 
 
 def test_a_crowded_narrow_street_is_filled_as_far_as_it_goes():

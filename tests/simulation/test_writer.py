@@ -80,6 +80,16 @@ def test_whole_drives_belong_to_one_split(tmp_path):
     assert (tmp_path / "ImageSets" / "val.txt").read_text().split() == ids[40:]
 
 
+@pytest.mark.parametrize(
+    ("frames", "drive", "train", "val"),
+    [(1, 1, [0], [0]), (2, 1, [0], [1]), (4, 1, [0, 1, 2], [3]), (4, 4, [0, 1, 2], [3]), (3, 2, [0, 1], [2])],
+)
+def test_small_sets_leave_no_list_empty(tmp_path, frames, drive, train, val):
+    kitti_layout.write_splits(tmp_path, [str(k) for k in range(frames)], drive)
+    read = [(tmp_path / "ImageSets" / f"{name}.txt").read_text().split() for name in ("train", "val")]
+    assert read == [[str(k) for k in train], [str(k) for k in val]]
+
+
 def test_the_sanity_rules_hold_at_full_size(tmp_path):
     write_dataset(Recipe("kitti64", 1, seed=4, street="city"), tmp_path / "k")
     assert check_kitti(KittiDataset(tmp_path / "k")) == []
@@ -90,6 +100,7 @@ def test_nuscenes_reader_finds_what_was_simulated(tmp_path, tiny_presets):
     recipe = Recipe("nuscenes32", 2, seed=2, sequence=True, street="residential")
     assert write_dataset(recipe, root) == ["0000_0000", "0000_0001"]
     assert check_nuscenes(root) == []
+    assert (root / "train.txt").read_text() == (root / "val.txt").read_text() != ""  # the only drive is in both
     dataset = NuscenesDataset(root)
     simulated = list(simulate_drive("nuscenes32", 2, 2, street="residential"))
     for frame, expected in zip(dataset, simulated, strict=True):

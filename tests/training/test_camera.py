@@ -130,6 +130,14 @@ def test_the_command_trains_and_exports(tmp_path: Path, monkeypatch: pytest.Monk
     result = CliRunner().invoke(app, arguments, catch_exceptions=False)
     assert result.exit_code == 0
     assert OnnxDetector(tmp_path / "camera.onnx").layout == "ultralytics"
+    fitted, measured = [], []
+    monkeypatch.setattr("lcf3d.training.camera_calibration.calibrate", lambda _, images: fitted.extend(images))
+    monkeypatch.setattr(CameraTask, "validate", lambda one, _: measured.append(one.held_out) or {})
+    both = CliRunner().invoke(app, ["--out", str(tmp_path / "two"), "--steps", "1", "--held-out", "2"])
+    assert both.exit_code == 0
+    # scores are fitted on other images than the last figures are of
+    assert [image is IMAGES[1] for image in fitted] == [True]
+    assert [image is IMAGES[2] for image in measured[-1]] == [True]
     again = CliRunner().invoke(app, arguments)
     assert isinstance(again.exception, ConfigError)
     few = CliRunner().invoke(app, ["--out", str(tmp_path), "--held-out", "3"])

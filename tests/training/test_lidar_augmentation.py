@@ -10,11 +10,13 @@ import pytest
 from lcf3d.geometry.boxes import points_in_boxes
 from lcf3d.geometry.iou import bev_iou
 from lcf3d.training.lidar_augmentation import (
+    MOST_POINTS_OF_OBJECT,
     AugmentationSettings,
     augment,
     choose_window,
     collect_objects,
     crop,
+    cut_out,
     mirrored,
     scaled,
     tilted,
@@ -50,6 +52,29 @@ def test_tilted_ground_carries_the_boxes():
     ]
     assert np.ptp(heights[0][:, 2] - heights[0][:, 5] / 2) < 1e-9
     assert np.ptp(heights[1][:, 2] - heights[1][:, 5] / 2) > 0.01
+
+
+def test_intensities_to_255_change_like_those_to_one():
+    counted = scene(0)
+    counted.points[:, 3] *= 255
+    one, many = (
+        augment(scan, AROUND, 1.0, None, AugmentationSettings(), np.random.default_rng(3)).points
+        for scan in (scene(0), counted)
+    )
+    assert 100 < many[:, 3].max() <= 255
+    np.testing.assert_allclose(many[:, 3], 255 * one[:, 3], rtol=1e-4, atol=1e-3)
+
+
+def test_of_many_points_of_an_object_some_of_every_side_are_kept():
+    box = np.array([5.0, 2.0, 0.0, 4.0, 2.0, 1.5, 0.0])
+    along = np.linspace(3.01, 6.99, 4 * MOST_POINTS_OF_OBJECT)
+    points = np.column_stack([along, np.full((len(along), 1), 2.0), np.zeros((len(along), 2))]).astype(np.float32)
+    kept = cut_out(points, box)
+    assert len(kept) == MOST_POINTS_OF_OBJECT
+    assert np.diff(kept[:, 0]).max() < 0.01
+    assert kept[0, 0] == points[0, 0]
+    assert kept[-1, 0] == points[-1, 0]
+    np.testing.assert_array_equal(cut_out(points[:100], box), points[:100])
 
 
 def test_turning_back_gives_the_scan():

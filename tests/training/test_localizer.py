@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -62,6 +64,15 @@ def test_augmentation_moves_points_and_box_together(pool, seed):
         # a tilt shears the box's points by a few millimetres at most
         grown = sample.box + np.array([0, 0, 0, 0.1, 0.1, 0.1, 0])
         assert points_in_boxes(sample.points, grown[None])[0][sample.inside].all()
+
+
+def test_what_nobody_has_labelled_is_no_frustum_of_nothing():
+    wide = np.array([[-2000.0, -2000.0, 4000.0, 4000.0]])  # a region much larger than any box in it
+    free = collect((street(seed) for seed in range(20)), LABELS, seed=0)
+    unknown = collect((replace(street(seed), unknown2d=wide) for seed in range(20)), LABELS, seed=0)
+    assert sum(f.empty for f in free) > 3
+    assert not any(f.empty for f in unknown)
+    assert sum(not f.empty for f in unknown) == sum(not f.empty for f in free)
 
 
 def test_turning_the_car_keeps_points_in_their_boxes():

@@ -50,9 +50,10 @@ def ablate(
 
     from lcf3d.cli.console import plain, print_table, tracked
     from lcf3d.evaluation.ablation import ablate as measure
-    from lcf3d.evaluation.protocol import open_evaluation, usual_frames
-    from lcf3d.run.setup import RunRequest, find_calibration, read_inputs
+    from lcf3d.evaluation.opening import open_evaluation, usual_frames
+    from lcf3d.run.setup import RunRequest, read_inputs
     from lcf3d.run.sources import LidarOnScans
+    from lcf3d.run.teaching import find_calibration
 
     request = RunRequest(
         dataset,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from functools import cache
 from importlib import import_module
 from typing import Annotated
 
@@ -36,13 +37,6 @@ VERBS: dict[str, str] = {
 # verbs with verbs of their own: module of lcf3d.cli that defines a typer app of that name
 GROUPS: dict[str, str] = {"train": "train"}
 
-app = typer.Typer(
-    name="lcf3d",
-    help="Late-cascade fusion of camera and LiDAR detections for 3D object detection.",
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
-)
-
 
 def _print_version(wanted: bool) -> None:
     if wanted:
@@ -52,8 +46,7 @@ def _print_version(wanted: bool) -> None:
         raise typer.Exit
 
 
-@app.callback()
-def options(
+def _options(
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="say what is being done")] = False,
     version: Annotated[
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="print the version and stop")
@@ -65,18 +58,44 @@ def options(
     start_logging(verbose)
 
 
-for verb, module in VERBS.items():
-    # what goes on to ROS is not ours to know
-    passing = {"ignore_unknown_options": True} if verb == "ros2" else {}
-    app.command(verb, context_settings=passing)(getattr(import_module(f"lcf3d.cli.{module}"), verb))
-for group, module in GROUPS.items():
-    app.add_typer(getattr(import_module(f"lcf3d.cli.{module}"), group))
+def command(only: str | None = None) -> typer.Typer:
+    """The command with all verbs; or with one alone, which spares the imports of all others."""
+    made = typer.Typer(
+        name="lcf3d",
+        help="Late-cascade fusion of camera and LiDAR detections for 3D object detection.",
+        no_args_is_help=True,
+        pretty_exceptions_enable=False,
+    )
+    made.callback()(_options)
+    for verb, module in VERBS.items():
+        if only in (None, verb):
+            # what goes on to ROS is not ours to know
+            passing = {"ignore_unknown_options": True} if verb == "ros2" else {}
+            made.command(verb, context_settings=passing)(getattr(import_module(f"lcf3d.cli.{module}"), verb))
+    for group, module in GROUPS.items():
+        if only in (None, group):
+            made.add_typer(getattr(import_module(f"lcf3d.cli.{module}"), group))
+    return made
+
+
+@cache
+def _whole() -> typer.Typer:
+    return command()
+
+
+def __getattr__(name: str) -> typer.Typer:
+    """``app``: the command with all verbs, made when it is asked for."""
+    if name == "app":
+        return _whole()
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 def main() -> None:
     """Entry point of the ``lcf3d`` command."""
+    # options before the verb take no values
+    asked = next((word for word in sys.argv[1:] if not word.startswith("-")), "")
     try:
-        app()
+        (command(asked) if asked in (*VERBS, *GROUPS) else _whole())()
     except Lcf3dError as error:
         from lcf3d.remote.places import legible
 

@@ -56,7 +56,8 @@ def eval(
     from lcf3d.cli.console import console, print_table
     from lcf3d.datasets.base import require_missing
     from lcf3d.datasets.opening import open_dataset
-    from lcf3d.evaluation.protocol import EvaluationOptions, open_evaluation
+    from lcf3d.evaluation.opening import open_evaluation
+    from lcf3d.evaluation.protocol import EvaluationOptions
     from lcf3d.remote.places import local
     from lcf3d.run.conversion import as_files
 

@@ -50,7 +50,8 @@ def live(
     from lcf3d.live.outputs import Outputs
     from lcf3d.live.replay import in_order, make_fuser, replay
     from lcf3d.live.warming import settle_memory
-    from lcf3d.run.setup import RunRequest, calibrated_fusion, find_calibration, read_inputs
+    from lcf3d.run.setup import RunRequest, calibrated_fusion, read_inputs
+    from lcf3d.run.teaching import find_calibration
 
     request = RunRequest(
         dataset, lidar, {"*": camera}, split=split, tables=tables, config=config, changes=tuple(set_ or ()),

@@ -10,18 +10,24 @@ import typer
 
 from lcf3d.errors import ConfigError, Lcf3dError
 
+FAILED = "not measured:"
+"""How the note of a row begins whose run failed."""
+
 if TYPE_CHECKING:
     from lcf3d.paper.tables import Row, Table
     from lcf3d.paper.workplace import Measured, Workplace
 
 
 def paper(
-    table: Annotated[str, typer.Argument(help="list, splits, all, or one of the list, for example table-1")] = "list",
+    table: Annotated[
+        str, typer.Argument(help="list, splits, all, or one of the list, for example table-1; with --rehearse all")
+    ] = "",
     out: Annotated[Path, typer.Option(help="folder for the tables and the runs behind them")] = Path("tables"),
     kitti: Annotated[Path | None, typer.Option(help="folder of KITTI's object benchmark")] = None,
     nuscenes: Annotated[Path | None, typer.Option(help="folder of nuScenes")] = None,
     row: Annotated[
-        list[str] | None, typer.Option(help="only the row of which this is the name or its beginning; repeatable")
+        list[str] | None,
+        typer.Option(help="only rows of which this is the name or its beginning; repeatable"),
     ] = None,
     use: Annotated[
         list[str] | None,
@@ -31,7 +37,10 @@ def paper(
         list[str] | None, typer.Option(help="result files of any row's system, NAME=DIR; one table; repeatable")
     ] = None,
     rehearse: Annotated[
-        bool, typer.Option("--rehearse", help="weights filled by rule for all networks: do all steps run here?")
+        bool,
+        typer.Option(
+            "--rehearse", help="weights filled by rule, and simulated frames where no data is named: do all steps run?"
+        ),
     ] = False,
     device: Annotated[str, typer.Option(help="of the networks: cpu or cuda")] = "cpu",
     dry: Annotated[bool, typer.Option("--dry", help="run nothing: the numbers, and what would be needed")] = False,
@@ -50,11 +59,14 @@ def paper(
     lcf3d paper table-2 --kitti KITTI --results LoGoNet=DIR   fills the row of a quoted system
 
     lcf3d paper splits --out KITTI/ImageSets                  train.txt and val.txt of the usual split
+
+    lcf3d paper --rehearse --out rehearsal                    all of it on simulated frames, without any download
     """
     from lcf3d.files import write_text
     from lcf3d.paper.networks import parse_uses
-    from lcf3d.paper.tables import find_table, paper_tables
+    from lcf3d.paper.tables import find_rows, find_table, paper_tables
 
+    table = table or ("all" if rehearse else "list")
     if table == "list":
         return _print_list(json_)
     if table == "splits":
@@ -63,22 +75,42 @@ def paper(
         for name, ids in (("train", KITTI_TRAIN), ("val", KITTI_VAL)):
             write_text(out / f"{name}.txt", "".join(f"{frame_id}\n" for frame_id in ids))
         return typer.echo(f"wrote {out / 'train.txt'} ({len(KITTI_TRAIN):,} frames) and val.txt ({len(KITTI_VAL):,})")
-    tables = list(paper_tables().values()) if table == "all" else [find_table(table)]
-    if len(tables) > 1 and (row or results):
-        raise ConfigError("--row and --results are for one table; name it")
+    chosen = find_rows(list(paper_tables().values()) if table == "all" else [find_table(table)], row or [])
+    if len(chosen) > 1 and results:
+        raise ConfigError("--results is for one table; name it")
     uses = parse_uses(tuple(use or ()))
+    roots = {k: v.expanduser() for k, v in (("kitti", kitti), ("nuscenes", nuscenes)) if v is not None}
+    for kind, folder in roots.items():
+        if not folder.is_dir():
+            raise ConfigError(f"--{kind} {folder}: there is no such folder")
     if rehearse:
+        from lcf3d.paper.cost import networks_of
         from lcf3d.paper.rehearsal import filled_weights
 
-        names = {name for one in tables for r in _chosen(one, row) for name in r.networks}
+        names = {name for one, rows in chosen for r in rows for name in networks_of(one, r)}
         uses = {**filled_weights(sorted(names - set(uses)), out / "rehearsal"), **uses}
-    roots = {k: v.expanduser() for k, v in (("kitti", kitti), ("nuscenes", nuscenes)) if v is not None}
-    return _measure(tables, row, results, roots, uses, out, device, dry, overwrite, json_)
+        roots = {
+            **_simulated({kind for one, _ in chosen for kind in one.data} - set(roots), out / "rehearsal"),
+            **roots,
+        }
+    failed = _measure(chosen, results, roots, uses, out, device, dry, overwrite, json_)
+    if rehearse and failed:
+        typer.echo(f"error: {len(failed)} rows did not run, first {failed[0]}; the notes say why", err=True)
+        raise typer.Exit(1)
+
+
+def _simulated(kinds: set[str], folder: Path) -> dict[str, Path]:
+    """Folders of simulated frames by kind of dataset; what is there is taken."""
+    from lcf3d.paper.rehearsal import DATA
+    from lcf3d.simulation.writer import Recipe, write_dataset
+
+    for kind in sorted(kinds):
+        write_dataset(Recipe(*DATA[kind]), folder / kind, resume=True)
+    return {kind: folder / kind for kind in sorted(kinds)}
 
 
 def _measure(
-    tables: list[Table],
-    names: list[str] | None,
+    chosen: list[tuple[Table, tuple[Row, ...]]],
     results: list[str] | None,
     roots: Mapping[str, Path],
     uses: Mapping[str, str],
@@ -87,8 +119,8 @@ def _measure(
     dry: bool,
     overwrite: bool,
     json_: bool,
-) -> None:
-    """Measure, print and write tables one after the other."""
+) -> list[str]:
+    """Measure, print and write tables one after the other; the rows that failed, not those that lack something."""
     import json
 
     from rich.console import Console
@@ -106,9 +138,8 @@ def _measure(
             bar = progress.add_task(name, total=frames)
             return lambda: progress.advance(bar)
 
-        for one in tables:
+        for one, rows in chosen:
             place = Workplace(out, roots, uses, _given(one, results), device, overwrite, begin)
-            rows = _chosen(one, names)
             measured = _needs(one, rows) if dry else _measured(one, rows, place)
             contents.append(to_json(one, rows, measured))
             data = table_data(one, rows, measured)
@@ -120,12 +151,8 @@ def _measure(
                 print_table(data)
     if json_:
         typer.echo(json.dumps(contents if len(contents) > 1 else contents[0], indent=2))
-
-
-def _chosen(table: Table, names: list[str] | None) -> tuple[Row, ...]:
-    from lcf3d.paper.tables import find_row
-
-    return tuple(find_row(table, name) for name in names) if names else table.rows
+    rows_of = [(content["table"], row) for content in contents for row in content["rows"]]
+    return [f"{t}: {row['name']}" for t, row in rows_of if any(n.startswith(FAILED) for n in row["notes"])]
 
 
 def _given(table: Table, results: list[str] | None) -> dict[str, Path]:
@@ -147,6 +174,7 @@ def _given(table: Table, results: list[str] | None) -> dict[str, Path]:
 
 def _measured(table: Table, rows: tuple[Row, ...], place: Workplace) -> dict[str, Measured]:
     """All rows, those that cannot be measured with the reason."""
+    from lcf3d.paper.estimates import about
     from lcf3d.paper.measure import measure_row
     from lcf3d.paper.networks import NeedsError
     from lcf3d.paper.workplace import without_values
@@ -154,25 +182,42 @@ def _measured(table: Table, rows: tuple[Row, ...], place: Workplace) -> dict[str
     if table.measure == "cost":
         from lcf3d.paper.cost import cost_rows, measure_costs
 
-        return cost_rows(table, rows, measure_costs(_fusion_ms, place.device), place.device)
-    measured = {}
+        try:
+            costs = measure_costs(_fusion_ms, place.uses, place.device)
+        except NeedsError as error:
+            return {row.name: without_values(table, f"needs {error}") for row in rows}
+        return cost_rows(table, rows, costs, place.uses, place.device)
+    measured, absent = {}, []
     for row in rows:
         try:
             measured[row.name] = measure_row(table, row, place)
         except NeedsError as error:
-            measured[row.name] = without_values(table, f"needs {error}" if not row.quoted else str(error))
+            told = row.quoted or row.needs
+            measured[row.name] = without_values(table, *([told] if told else (f"needs {p}" for p in error.parts)))
+            absent += [row] if row.networks else []
         except ConfigError:
             raise
         except Lcf3dError as error:
-            measured[row.name] = without_values(table, f"not measured: {error}")
+            measured[row.name] = without_values(table, f"{FAILED} {error}")
+    for row in absent:
+        # what all of them take together, since a network runs once for all rows
+        measured[row.name] = without_values(table, *measured[row.name].notes, about(table, absent))
     return measured
 
 
 def _needs(table: Table, rows: tuple[Row, ...]) -> dict[str, Measured]:
     """What each row would need."""
+    from lcf3d.paper.estimates import DATA, about
     from lcf3d.paper.workplace import without_values
 
-    return {r.name: without_values(table, r.quoted or r.needs or f"needs {', '.join(r.networks)}") for r in rows}
+    found = {}
+    for row in rows:
+        kinds = ((row.task[1],) if row.task else table.data) if row.lidar else ()
+        data = (f"needs --{kind} FOLDER: {DATA[kind]}" for kind in kinds)
+        own = row.quoted or row.needs or f"needs {', '.join(row.networks) or 'no data'}"
+        takes = (about(table, rows) if table.data else "minutes",) if not row.quoted and not row.needs else ()
+        found[row.name] = without_values(table, own, *data, *takes)
+    return found
 
 
 def _fusion_ms() -> dict[str, float]:

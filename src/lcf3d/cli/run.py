@@ -87,9 +87,12 @@ def run(
     """
     import json
 
+    from lcf3d.formats.bag_files import require_writer
     from lcf3d.remote.places import local
     from lcf3d.remote.urls import is_url, url_of
     from lcf3d.run.frames import total
+    from lcf3d.run.ray_workers import require_processes
+    from lcf3d.run.sequences import pending_frames
     from lcf3d.run.setup import RunRequest, prepare_run
 
     request = RunRequest(
@@ -116,13 +119,11 @@ def run(
         raise ConfigError(f"--format takes folder, parquet, {', '.join(_BAGS)}, got {format_!r}")
     if format_ in _BAGS and is_url(out):
         raise ConfigError(f"--format {format_} writes a bag on this machine; --out {url_of(out)} is elsewhere")
+    require_processes(request, jobs, ray)
+    if format_ in _BAGS:
+        require_writer(_BAGS[format_])
     prepared = prepare_run(request, local(out, new=True), resume=resume, overwrite=overwrite)
-    sequences = _sequences(prepared) if memory or smooth else None
-    pending = (
-        [frame_id for frame_id in prepared.frame_ids if not prepared.folder.is_done(frame_id)]
-        if sequences is None
-        else [frame_id for sequence in sequences for frame_id in sequence]
-    )
+    pending, sequences = pending_frames(prepared)
     summaries = _fuse(prepared, pending, jobs, sequences, ray, quiet=json_)
     prepared.folder.finish(prepared.frame_ids)
     if format_ in _BAGS:
@@ -149,13 +150,6 @@ def _cameras(camera: str | None, left: str | None, right: str | None) -> dict[st
     if left and right and not camera:
         return {"left": left, "right": right}
     raise ConfigError("name the camera branch with --camera, or with both --camera-left and --camera-right")
-
-
-def _sequences(prepared: Run) -> list[Sequence[str]]:
-    """The sequences that are still to be run, each in order of time."""
-    from lcf3d.run.sequences import in_order, pending
-
-    return pending(in_order(prepared.dataset, prepared.frame_ids), prepared.folder.is_done)
 
 
 def _fuse(

@@ -20,18 +20,21 @@ def serve(
     from lcf3d.cli.console import console
     from lcf3d.cli.eval import report_origin
     from lcf3d.cli.export import dataset_of_run
-    from lcf3d.evaluation.protocol import EvaluationOptions, open_evaluation
-    from lcf3d.evaluation.server import HOST, report_app
+    from lcf3d.evaluation.opening import open_evaluation
+    from lcf3d.evaluation.protocol import EvaluationOptions
+    from lcf3d.evaluation.server import HOST, listen, report_app
     from lcf3d.evaluation.server import serve as serve_app
     from lcf3d.remote.places import local
     from lcf3d.run.conversion import as_files
     from lcf3d.run.table_folder import open_run_folder
 
+    # before anything is read
+    listening = listen(port)
     folder = local(run)
     data, name = dataset_of_run(folder, dataset)
     done = set(open_run_folder(folder).frame_ids())
     evaluation = open_evaluation(data, [frame_id for frame_id in data.ids if frame_id in done])
     results = evaluation.read(as_files(folder, data), folder.resolve().name)
     app = report_app(results, data, report_origin(data, name, [folder], EvaluationOptions()))
-    console().print(f"http://{HOST}:{port}/ (stop with Ctrl-C)", soft_wrap=True)
-    serve_app(app, port)
+    console().print(f"http://{HOST}:{listening.getsockname()[1]}/ (stop with Ctrl-C)", soft_wrap=True)
+    serve_app(app, listening)

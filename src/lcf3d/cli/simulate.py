@@ -50,4 +50,4 @@ def simulate(
         task = bar.add_task("frames", total=frames)
         ids = write_dataset(recipe, out, jobs, resume, lambda n: bar.advance(task, n))
     layout = get_preset(preset).layout
-    console.print(f"{len(ids)} frames in {out}; look at one with: lcf3d view {layout}:{out}")
+    console.print(f"{len(ids)} frame{'s' * (len(ids) != 1)} in {out}; look at one with: lcf3d view {layout}:{out}")

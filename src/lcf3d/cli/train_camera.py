@@ -45,8 +45,9 @@ def camera(
     workers: Annotated[int, typer.Option(min=0, help="processes that prepare batches")] = 0,
     threads: Annotated[int, typer.Option(min=0, help="threads of torch; 0 leaves it to torch")] = 0,
     init: Annotated[
-        Path | None, typer.Option(help="last.pt of another training, whose weights this one begins with")
-    ] = None,
+        str,
+        typer.Option(help="weights to begin with: last.pt of another training, a camera.onnx, or shipped:kitti"),
+    ] = "",
     device: Annotated[str, typer.Option(help="torch's name of the device to train on")] = "cpu",
     resume: Annotated[bool, typer.Option("--resume", help="go on from the folder's last checkpoint")] = False,
 ) -> None:
@@ -56,18 +57,22 @@ def camera(
 
     lcf3d train camera --out train-camera
 
-    lcf3d train camera kitti:KITTI --split train --no-masks --steps 20000 --out train-camera-kitti
+    lcf3d train camera kitti:KITTI --split train --no-masks --init shipped:kitti --out train-camera-kitti
     """
-    from lcf3d.cli.train_common import held_out_of, train_with_progress
+    from lcf3d.cli.train_common import beginning, held_out_of, train_with_progress
+    from lcf3d.detectors.camera.small import shipped_path
     from lcf3d.detectors.camera.small_network import SmallConfig
     from lcf3d.training.camera import CameraTask
-    from lcf3d.training.loop import TrainingSettings, import_torch, require_device
+    from lcf3d.training.loop import TrainingSettings, import_torch, require_device, require_unused
     from lcf3d.training.samples import SampleRecipe
 
     torch = import_torch()
     require_device(device)
     if threads:
         torch.set_num_threads(threads)
+    start, begin = beginning(init, shipped_path)
+    if not resume:
+        require_unused(out)
     recipe = SampleRecipe("camera", preset, frames, samples_seed, SAMPLE_SCALE, density)
     if dataset:
         if masks:
@@ -78,11 +83,11 @@ def camera(
     last = held_out_of(len(images), held_out, 50)
     config = SmallConfig() if masks else SmallConfig(prototypes=0)
     data = f"{dataset} {split}" if dataset else recipe.folder
-    task = CameraTask(images[:-last], images[-last:], config, batch_size, data=data)
+    task = CameraTask(images[:-last], images[-last:], config, batch_size, data=data, begin=begin)
     settings = TrainingSettings(
         steps, learning_rate, seed=seed, average=0.998, checkpoint_every=checkpoint_every, workers=workers
     )
-    network = train_with_progress(task, settings, out, resume, init, device)
+    network = train_with_progress(task, settings, out, resume, start, device)
     _finish(task, network, out)
 
 

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any
 from lcf3d.errors import ConfigError
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from lcf3d.training.loop import TrainingSettings, TrainingTask
     from lcf3d.training.samples import SampleRecipe
 
@@ -40,6 +42,27 @@ def held_out_of(count: int, asked: int | None, usual: int) -> int:
     if count <= held_out:
         raise ConfigError(f"there are {count} samples, too few to hold out {held_out}; lower --held-out")
     return held_out
+
+
+def beginning(init: str, shipped: Callable[[str], Path]) -> tuple[Path | None, Path | None]:
+    """A training's checkpoint, or an exported network, that a training begins with.
+
+    Args:
+        init: a path, ``shipped:NAME``, or nothing.
+        shipped: gives the file of a network that comes with lcf3d.
+
+    Raises:
+        ConfigError: there is no such file, or lcf3d ships no such network.
+        DetectorError: lcf3d ships no such network.
+    """
+    if init.startswith("shipped:"):
+        return None, shipped(init.removeprefix("shipped:"))
+    path = Path(init) if init else None
+    if path is not None and not path.is_file():
+        raise ConfigError(
+            f"--init {init} does not exist; name last.pt of a training, an exported .onnx file or shipped:kitti"
+        )
+    return (None, path) if path is not None and path.suffix == ".onnx" else (path, None)
 
 
 def train_with_progress(

@@ -67,10 +67,11 @@ def lidar(
 
     lcf3d train lidar kitti:KITTI --split train --init train-lidar/last.pt --out train-lidar-kitti
     """
-    from lcf3d.cli.train_common import held_out_of, train_with_progress
+    from lcf3d.cli.train_common import beginning, held_out_of, train_with_progress
+    from lcf3d.detectors.lidar.kinds import shipped_path
     from lcf3d.training.lidar import LidarTask, objects_of
     from lcf3d.training.lidar_augmentation import AugmentationSettings
-    from lcf3d.training.loop import TrainingSettings, import_torch, require_device
+    from lcf3d.training.loop import TrainingSettings, import_torch, require_device, require_unused
     from lcf3d.training.samples import SampleRecipe
 
     torch = import_torch()
@@ -79,7 +80,9 @@ def lidar(
         torch.set_num_threads(threads)
     recipe = SampleRecipe("lidar", preset, frames, samples_seed, density=density)
     config, painter = _painting(paint, frustums, dataset)
-    start, begin = _beginning(init)
+    start, begin = beginning(init, shipped_path)
+    if not resume:
+        require_unused(out)
     scans = _scans(dataset, split, version, recipe, samples, jobs, painter)
     learned, measured = scans.hold_out(held_out_of(scans.count, held_out, 100))
     objects = objects_of(learned, config)
@@ -130,16 +133,6 @@ def _painting(paint: str, frustums: str, dataset: str) -> tuple[LidarConfig, Pai
     if paint:
         return painted_config(paint), load_painter(paint, COMPACT_KITTI.class_names)
     return painted_config(frustums, only_painted=True), frustum_painter(frustums, COMPACT_KITTI.class_names)
-
-
-def _beginning(init: str) -> tuple[Path | None, Path | None]:
-    """A training's checkpoint, or an exported network, that a training begins with."""
-    from lcf3d.detectors.lidar.kinds import shipped_path
-
-    if init.startswith("shipped:"):
-        return None, shipped_path(init.removeprefix("shipped:"))
-    path = Path(init) if init else None
-    return (None, path) if path is not None and path.suffix == ".onnx" else (path, None)
 
 
 def _scans(

@@ -32,7 +32,10 @@ def localizer(
     samples: Annotated[Path | None, typer.Option(help="folder that keeps simulated samples")] = None,
     jobs: Annotated[int, typer.Option(min=1, help="processes that simulate")] = 2,
     init: Annotated[
-        Path | None, typer.Option(help="last.pt of another training, whose weights this one begins with")
+        Path | None,
+        typer.Option(
+            exists=True, dir_okay=False, help="last.pt of another training, whose weights this one begins with"
+        ),
     ] = None,
     device: Annotated[str, typer.Option(help="torch's name of the device to train on")] = "cpu",
     resume: Annotated[bool, typer.Option("--resume", help="go on with a training that was interrupted")] = False,
@@ -50,10 +53,12 @@ def localizer(
     from lcf3d.cli.train_common import train_with_progress
     from lcf3d.localizers.spec import LocalizerSpec
     from lcf3d.training.localizer import LocalizerTask
-    from lcf3d.training.loop import require_device
+    from lcf3d.training.loop import require_device, require_unused
     from lcf3d.training.recipes import VARIANTS, recipe_of
 
     require_device(device)
+    if not resume:
+        require_unused(out)
     recipe = recipe_of(classes)
     if variant not in VARIANTS:
         raise ConfigError(f"--variant takes {', '.join(VARIANTS)}, got {variant!r}")

@@ -26,7 +26,9 @@ def view(
         Path | None, typer.Option(help="a .png file for one frame, else a folder; by default ID.png or RUN/pictures")
     ] = None,
     truth: Annotated[bool, typer.Option(help="also draw the ground truth, thin and white")] = True,
-    limit: Annotated[int | None, typer.Option(min=1, help="draw at most so many frames")] = None,
+    limit: Annotated[
+        int, typer.Option(min=0, help="of frames that are not named draw the first so many; 0 draws all of them")
+    ] = 50,
     min_score: Annotated[float, typer.Option(help="leave out boxes of a lower score")] = float("-inf"),
     gif: Annotated[
         Path | None, typer.Option(help="no pictures but one that moves: a .gif file, with the trails of tracks")
@@ -61,9 +63,11 @@ def view(
         raise ConfigError(f"{source} is a run folder and holds its own results; leave --results out")
     dataset = _open_run(run_folder) if run_folder else open_dataset(source)
     shown = run_folder or (None if results is None else local(results))
-    ids = _frame_ids(dataset, frame or [], shown, limit)
+    ids, more = _frame_ids(dataset, frame or [], shown, limit)
+    rest = f", {more} more with --limit 0" if more else ""
     if rerun is not None:
-        _record(dataset, shown, ids, None if rerun == "viewer" else Path(rerun), truth)
+        place = _record(dataset, shown, ids, None if rerun == "viewer" else Path(rerun), truth)
+        typer.echo(f"{len(ids)} frames in {place}{rest}")
         return
     scene_of = _scenes(dataset, shown, truth, min_score, ids[0])
     if gif is not None:
@@ -72,18 +76,18 @@ def view(
         with Progress(disable=len(ids) < 2) as progress:
             frames = (dataset.frame(frame_id) for frame_id in progress.track(ids, description="drawing"))
             save_gif(((frame.timestamp, draw_frame(frame, scene_of(frame))) for frame in frames), gif)
-        typer.echo(f"{len(ids)} frames in {gif}")
+        typer.echo(f"{len(ids)} frames in {gif}{rest}")
         return
     paths = _paths(ids, out, run_folder)
     with Progress(disable=len(ids) < 2) as progress:
         for frame_id in progress.track(ids, description="drawing"):
             item = dataset.frame(frame_id)
             save_png(draw_frame(item, scene_of(item)), paths[frame_id])
-    typer.echo(str(paths[ids[0]] if len(ids) == 1 else f"{len(ids)} pictures in {paths[ids[0]].parent}"))
+    typer.echo(str(paths[ids[0]] if len(ids) == 1 else f"{len(ids)} pictures in {paths[ids[0]].parent}{rest}"))
 
 
-def _record(dataset: Dataset, shown: Path | None, ids: Sequence[str], path: Path | None, truth: bool) -> None:
-    """The frames of a run into a Rerun recording or viewer."""
+def _record(dataset: Dataset, shown: Path | None, ids: Sequence[str], path: Path | None, truth: bool) -> str:
+    """The frames of a run into a Rerun recording or viewer; gives where they are."""
     from rich.progress import Progress
 
     from lcf3d.run.folder import RunFolder
@@ -101,7 +105,7 @@ def _record(dataset: Dataset, shown: Path | None, ids: Sequence[str], path: Path
             frame = dataset.frame(frame_id)
             log.log(frame, folder.read(frame_id), truth=frame.labels if truth else None)
     log.close()
-    typer.echo(f"{len(ids)} frames in {path or 'the viewer'}")
+    return str(path or "the viewer")
 
 
 def _run_folder(source: str) -> Path | None:
@@ -134,13 +138,15 @@ def _open_run(run_folder: Path) -> Dataset:
         raise ConfigError(f"the dataset of this run is not there ({error}); {instead}") from None
 
 
-def _frame_ids(dataset: Dataset, chosen: Sequence[str], shown: Path | None, limit: int | None) -> list[str]:
-    """The frames to draw: those chosen, else those of the run."""
+def _frame_ids(dataset: Dataset, chosen: Sequence[str], shown: Path | None, limit: int) -> tuple[list[str], int]:
+    """The frames to draw: those chosen, else the first of the run; and how many more the run has."""
     from lcf3d.datasets.base import require_frames
     from lcf3d.run.folder import RunFolder
     from lcf3d.run.table_folder import open_run_folder
 
+    most = None
     if not chosen:
+        most = limit or None
         if shown is None or not RunFolder.is_run(shown):
             raise ConfigError(
                 f"name the frames to draw with --frame, for example --frame {dataset.ids[0]}; "
@@ -149,7 +155,8 @@ def _frame_ids(dataset: Dataset, chosen: Sequence[str], shown: Path | None, limi
         chosen = open_run_folder(shown).frame_ids()
         if not chosen:
             raise ConfigError(f"{shown} holds no finished frames yet")
-    return list(require_frames(dataset, chosen, "the dataset"))[:limit]
+    ids = list(require_frames(dataset, chosen, "the dataset"))
+    return ids[:most], len(ids[most:]) if most else 0
 
 
 def _scenes(

@@ -211,7 +211,11 @@ def require_folder(root: Path) -> Path:
         DatasetError: it is not.
     """
     if not root.is_dir():
-        raise DatasetError(f"dataset folder {root} does not exist")
+        raise DatasetError(
+            f"{root} is a file; name the folder of the dataset"
+            if root.exists()
+            else f"dataset folder {root} does not exist"
+        )
     return root
 
 

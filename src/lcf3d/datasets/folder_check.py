@@ -108,7 +108,9 @@ def check_folder(
     try:
         evidence = _gather(dataset, results)
     except Lcf3dError as error:
-        return [*findings, Finding("FRM01", "error", str(error)), *check_frames(dataset, results, progress)]
+        frames = check_frames(dataset, results, progress)
+        told = any(finding.id == "FRM01" for finding in frames)
+        return [*findings, *([] if told else [Finding("FRM01", "error", str(error))]), *frames]
     ground = _check_ground(dataset, evidence)
     # with the ground in the wrong place, labels say nothing more
     labels = [] if ground else _check_labels(dataset, evidence)

@@ -7,8 +7,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
 from lcf3d.datasets.base import CameraSource, LidarSource
 from lcf3d.datasets.kitti_results import KittiCameraResults, KittiLidarResults
 from lcf3d.datasets.plain_results import PlainCameraResults, PlainLidarResults
@@ -149,7 +147,6 @@ class _Counted:
                 counted.cameras[camera] += len(one)
             else:
                 counted.taken += len(one)
-                counted.seen.update(self.class_names[label] for label in np.unique(one.labels).tolist())
         if frame_ids and not met:
             raise DatasetError(f"{self.path} has none of the {len(frame_ids)} frames; its first is {first!r}")
         counted.frames = +counted.frames
@@ -236,8 +233,10 @@ class _Cameras:
             whole.taken += source.left_out.taken
             whole.classes += source.left_out.classes
             whole.frames += source.left_out.frames
-            whole.seen |= source.left_out.seen
         return whole
+
+    reads_frames = True
+    """Whether `load` reads the files of the frames that it is given, and no others."""
 
     def load(self, frame_ids: Sequence[str]) -> None:
         """Read the files of these frames."""

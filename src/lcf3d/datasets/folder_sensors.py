@@ -7,6 +7,7 @@ Axes are named by where they point: ``forward-left-up`` (ROS vehicles and most s
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -281,20 +282,23 @@ def turn(axes: str) -> FloatArray:
     return matrix
 
 
+def _model_at(place: Sequence[int | str]) -> type[BaseModel]:
+    """What is described at a place of ``sensors.yaml``."""
+    models: Mapping[str, type[BaseModel]] = {"cameras": CameraSetup, "lidars": LidarSetup, "distortion": Lens}
+    return next((models[str(part)] for part in reversed(place) if part in models), Sensors)
+
+
 def _sentence(error: ValidationError) -> str:
     """The first of pydantic's complaints."""
     first = error.errors()[0]
     place = ".".join(str(part) for part in first["loc"])
     kind = first["type"]
     if kind == "extra_forbidden":
-        models: list[Any] = [Sensors, CameraSetup, LidarSetup, Lens]
-        owner = models[0]
-        if first["loc"][0] in ("cameras", "lidars"):
-            owner = CameraSetup if first["loc"][0] == "cameras" else LidarSetup
-            owner = Lens if "distortion" in first["loc"][:-1] else owner
-        return f"unknown key {place!r}; the keys there are {', '.join(owner.model_fields)}"
+        return f"unknown key {place!r}; the keys there are {', '.join(_model_at(first['loc'][:-1]).model_fields)}"
     if kind == "missing":
         return f"{place} is missing"
+    if kind == "model_type":
+        return f"{place} takes keys ({', '.join(_model_at(first['loc']).model_fields)}), got {first['input']!r}"
     return f"{place}: {first['msg'].removeprefix('Value error, ')}"
 
 

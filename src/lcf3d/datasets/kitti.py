@@ -174,6 +174,10 @@ class KittiDataset(KittiLikeDataset):
         return ids
 
     @cached_property
+    def _calibrations(self) -> Path:
+        return self.folder / "calib"
+
+    @cached_property
     def _calibrated(self) -> frozenset[str]:
         """Frames that have a calibration file of their own."""
         return frozenset(p.stem for p in list_files(self.folder / "calib", ".txt") if not p.name.startswith("calib_"))
@@ -208,7 +212,7 @@ class KittiDataset(KittiLikeDataset):
         """The calibration of a frame, or of the recording day where the frame has none of its own."""
         if self._raw is not None and frame_id not in self._calibrated:
             return self._raw[0]
-        return read_calibration(self.folder / "calib" / f"{frame_id}.txt")
+        return read_calibration(self._calibrations / f"{frame_id}.txt")
 
     def image_paths(self, frame_id: str) -> dict[str, Path]:
         """The image files of a frame that are there, by camera name."""

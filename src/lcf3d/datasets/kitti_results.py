@@ -54,7 +54,12 @@ class KittiResults:
         folder: holds ``ID.txt`` for every frame; a folder written by ``lcf3d run`` (with ``data/``) will do.
         class_names: classes to take; detections of others are left out.
         missing: ``error`` refuses a folder that lacks frames, ``empty`` takes them as frames without detections.
+
+    Attributes:
+        reads_frames: `load` reads the files of the frames that it is given, and no others.
     """
+
+    reads_frames = True
 
     def __init__(self, folder: str | Path, class_names: Sequence[str], missing: str = "error") -> None:
         path = Path(folder)
@@ -68,8 +73,8 @@ class KittiResults:
         """Read the files of these frames.
 
         Raises:
-            DatasetError: the folder misses some of them; says how many and which first. Or all of its detections are of
-                other classes.
+            DatasetError: the folder misses some of them; says how many and which first. Or all that was read so far is
+                of other classes.
             FormatError: a line is malformed; names file and line.
         """
         frames = read_folder(self.folder, frame_ids, results=True, missing=self.missing)
@@ -91,14 +96,14 @@ class KittiResults:
         Raises:
             DatasetError: none of them is of a class of the run.
         """
-        self.left_out = LeftOut(self.folder)
+        before, self.left_out = self.left_out, LeftOut(self.folder)
         for name, count in Counter(objects.class_names.tolist()).items():
             if name in self.class_names:
                 self.left_out.taken += count
-                self.left_out.seen.add(name)
             elif name != "DontCare":
                 self.left_out.classes[name] += count
-        self.left_out.require_some(self.class_names)
+        if not before.taken:
+            self.left_out.require_some(self.class_names)
 
     def require_probabilities(self, calibrated: Collection[str]) -> None:
         """See that the scores that `load` has read lie in [0, 1], but for those of classes that are ``calibrated``.
@@ -159,23 +164,6 @@ class KittiLidarResults(KittiResults):
         )
         assert objects.scores is not None  # of results
         return Detections3D.trusted(boxes, objects.scores[kept], table.labels[kept], self.class_names)
-
-    def score_range(self, frame_ids: Sequence[str]) -> tuple[float, float]:
-        """Lowest and highest score of what `detect` gives for these frames, 0 and 0 without any.
-
-        Raises:
-            DatasetError: as `detect` does.
-        """
-        low, high = 0.0, 0.0
-        for frame_id in frame_ids:
-            table, rows = self._of(frame_id)
-            boxed = table.boxed[rows]
-            self._require_boxes(frame_id, boxed)
-            assert table.objects.scores is not None  # of results
-            scores = table.objects.scores[_narrowed(rows, boxed & (table.labels[rows] >= 0))]
-            if len(scores):
-                low, high = min(low, float(scores.min())), max(high, float(scores.max()))
-        return low, high
 
     def _require_boxes(self, frame_id: str, boxed: BoolArray) -> None:
         """See that some object of a frame has a 3D box, if there are any."""

@@ -60,7 +60,6 @@ class NuscenesLidarResults:
                 name = found.class_names[label]
                 if name in joined:
                     self.left_out.taken += count
-                    self.left_out.seen.add(joined[name])
                 else:
                     self.left_out.classes[name] += count
         self.left_out.require_some(self.class_names)
@@ -117,11 +116,10 @@ class NuscenesCameraResults:
         known = set(frame_ids)
         out = self.left_out
         out.frames = Counter()
-        out.taken, out.seen = 0, set()
+        out.taken = 0
         for (token, _), one in self._found.items():
             if token in known:
                 out.taken += len(one)
-                out.seen |= {one.class_names[label] for label in set(one.labels.tolist())}
             else:
                 out.frames[token] += len(one)
         out.require_some(self._class_names, self._camera_names)

@@ -32,6 +32,9 @@ class _PlainResults(ABC):
         DatasetError: no such folder.
     """
 
+    reads_frames = True
+    """Whether `load` reads the files of the frames that it is given, and no others."""
+
     def __init__(self, folder: Path | str, class_names: Sequence[str], missing: str = "error") -> None:
         path = Path(folder)
         if not path.is_dir():
@@ -54,11 +57,12 @@ class _PlainResults(ABC):
             DatasetError: some are missing; says how many and which first.
         """
         absent = [frame_id for frame_id in frame_ids if not self._path(frame_id).is_file()]
-        if absent and (self.missing == "error" or len(absent) == len(frame_ids)):
+        nothing = len(absent) == len(frame_ids) and not self.left_out.taken
+        if absent and (self.missing == "error" or nothing):
             raise DatasetError(
                 f"{self.folder} lacks the results of {len(absent)} of {len(frame_ids)} frames, first {absent[0]}.json"
             )
-        self.left_out = LeftOut(self.folder)
+        before, self.left_out = self.left_out, LeftOut(self.folder)
         missing = set(absent)
         for frame_id in frame_ids:
             if frame_id not in missing:
@@ -66,7 +70,8 @@ class _PlainResults(ABC):
                 self._count(found, self._path(frame_id))
                 if len(self._kept) < MOST_KEPT:
                     self._kept[frame_id] = found
-        self.left_out.require_some(self.class_names, self.camera_names)
+        if not before.taken:
+            self.left_out.require_some(self.class_names, self.camera_names)
 
     @abstractmethod
     def _parse(self, path: Path) -> Any:
@@ -89,7 +94,6 @@ class _PlainResults(ABC):
             name = found.class_names[label]
             if name in joined:
                 self.left_out.taken += count
-                self.left_out.seen.add(joined[name])
             else:
                 self.left_out.classes[name] += count
 

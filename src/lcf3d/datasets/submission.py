@@ -40,6 +40,8 @@ def write_submission_file(text: str, dataset: Dataset, results: Path, out: Path)
         DatasetError: frames of the test set are missing.
         FormatError: a value that the server would refuse.
     """
+    if out.is_dir():
+        raise ConfigError(f"{out} is a folder; --out names the file to write, for example kitti.zip")
     kind = named(text).kind
     if kind == "kitti":
         return kitti_zip(results, out)
@@ -52,10 +54,11 @@ def kitti_zip(results: Path, out: Path, frame_ids: Sequence[str] = KITTI_TEST_FR
     """A zip with a result file of every test frame in its root; gives the number of files.
 
     Raises:
-        DatasetError: files are missing; says how many and which first.
+        DatasetError: files are missing, or of frames that the test set has not; says how many and which first.
         FormatError: a line is malformed, or has a class, box or score that the server does not take.
     """
     folder = results / "data" if (results / "data").is_dir() else results
+    _require_frames(folder, frame_ids)
     frames = read_folder(folder, tuple(frame_ids), results=True)
     objects = frames.objects
     names = [str(name) for name in np.unique(objects.class_names)]
@@ -70,6 +73,26 @@ def kitti_zip(results: Path, out: Path, frame_ids: Sequence[str] = KITTI_TEST_FR
         for frame_id, found in zip(frame_ids, frames, strict=True):
             archive.writestr(f"{frame_id}.txt", format_objects(found))
     return len(frame_ids)
+
+
+def _require_frames(folder: Path, frame_ids: Sequence[str]) -> None:
+    """See that a folder has a text file of every frame and of no other."""
+    if not folder.is_dir():
+        raise DatasetError(f"{folder} is not a folder; expected KITTI text files, one a frame")
+    present = {path.stem for path in folder.glob("*.txt")}
+    if not present and any(folder.rglob("*.parquet")):
+        raise DatasetError(f"{folder} holds parquet files; the server takes text: run with --format folder")
+    missing, others = sorted(set(frame_ids) - present), sorted(present - set(frame_ids))
+    if missing:
+        raise DatasetError(
+            f"{folder} lacks the files of {len(missing)} of the {len(frame_ids)} test frames, first {missing[0]}.txt; "
+            "run on the whole test set (an empty file means no objects)"
+        )
+    if others:
+        raise DatasetError(
+            f"{folder} holds {len(others)} files that are of no test frame, first {others[0]}.txt; "
+            "are they results of another set?"
+        )
 
 
 def nuscenes_json(results: Path, tokens: Sequence[str], out: Path, expected: int = NUSCENES_TEST_SAMPLES) -> int:

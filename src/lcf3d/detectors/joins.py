@@ -81,7 +81,6 @@ class LeftOut:
         classes: detections left out by class.
         cameras: detections left out by camera.
         frames: detections (or files) left out by frame.
-        seen: classes, as the run names them, of the detections that were taken.
     """
 
     place: Path | str
@@ -89,7 +88,6 @@ class LeftOut:
     classes: Counter[str] = field(default_factory=Counter)
     cameras: Counter[str] = field(default_factory=Counter)
     frames: Counter[str] = field(default_factory=Counter)
-    seen: set[str] = field(default_factory=set)
 
     def to_json(self) -> dict[str, dict[str, int]]:
         """Counts by kind, the first few of many frames; empty where everything was used."""

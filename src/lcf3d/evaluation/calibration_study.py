@@ -10,11 +10,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lcf3d.errors import DatasetError
-from lcf3d.evaluation.protocol import Evaluation, Verdict, open_evaluation, usual_frames
+from lcf3d.evaluation.opening import open_evaluation, usual_frames
+from lcf3d.evaluation.protocol import Evaluation, Verdict
 from lcf3d.frame import Frame
 from lcf3d.fusion.calibration import Calibration, ScoreMap, ground_height
 from lcf3d.fusion.calibration_fit import block_folds, choose_map, fit_evidence, fit_map, log_loss
 from lcf3d.fusion.cluster_evidence import ClusterEvidence
+from lcf3d.fusion.clustering import cluster_boxes
 from lcf3d.fusion.config import FusionConfig
 from lcf3d.fusion.evidence import Evidence, to_probability
 from lcf3d.fusion.pipeline import LateCascadeFusion
@@ -87,6 +89,9 @@ class FusedScores(NamedTuple):
 class CalibrationStudy:
     """Detections of two branches and the ground truth of the same frames.
 
+    A LiDAR branch without suppression reports an object many times over, and the protocol calls all but one of these
+    boxes wrong. The fusion passes one box a cluster on: only that one is judged and fitted on.
+
     Args:
         frames: with their cameras.
         evaluation: judges detections of these frames.
@@ -120,10 +125,42 @@ class CalibrationStudy:
             raise DatasetError(f"the LiDAR results hold no 3D boxes of {names}: nothing to calibrate")
 
     @cached_property
+    def standing(self) -> list[BoolArray]:
+        """(N,) by frame, which LiDAR detections stand for their cluster; the others are its doubles."""
+        config, masks = self.config, []
+        for found in self.lidar_inputs:
+            clusters = cluster_boxes(
+                found.boxes,
+                found.scores,
+                found.labels,
+                method=config.clustering,
+                iou_threshold=config.cluster_iou,
+                class_aware=config.class_aware,
+            )
+            masks.append(np.isin(np.arange(len(found)), clusters.representative))
+        return masks
+
+    @property
+    def doubles(self) -> int:
+        """LiDAR detections that stand for no cluster."""
+        return int(sum((~mask).sum() for mask in self.standing))
+
+    @cached_property
     def lidar(self) -> Assessed:
-        """LiDAR detections judged in 3D."""
-        verdict = self.evaluation.judge_lidar(self.lidar_inputs, self.sources[0])
-        return _assessed(self.lidar_inputs, range(len(self.lidar_inputs)), verdict)
+        """LiDAR detections judged in 3D; those that do not stand for their cluster are not."""
+        one_each, source = self._one_each(self.lidar_inputs), self.sources[0]
+        if self.doubles and hasattr(source, "objects"):
+            source = _StandingLines(source, dict(zip((f.id for f in self.frames), self.standing, strict=True)), self)
+        verdict = self.evaluation.judge_lidar(one_each, source)
+        rows = np.flatnonzero(np.concatenate(self.standing))
+        judged, right = np.zeros((2, sum(map(len, self.lidar_inputs))))
+        judged[rows], right[rows] = verdict.judged, verdict.right
+        whole = Verdict(judged.astype(bool), right)
+        return _assessed(self.lidar_inputs, range(len(self.lidar_inputs)), whole)
+
+    def _one_each(self, found: Sequence[Detections3D]) -> list[Detections3D]:
+        """The LiDAR detections without the doubles."""
+        return [own[mask] for own, mask in zip(found, self.standing, strict=True)]
 
     @cached_property
     def camera(self) -> Assessed:
@@ -236,7 +273,7 @@ class CalibrationStudy:
 
     @cached_property
     def _before(self) -> dict[str, tuple[float, ...]]:
-        return self.evaluation.figures(self.lidar_inputs)
+        return self.evaluation.figures(self._one_each(self.lidar_inputs))
 
     def _fit_maps(self, judged: Assessed, training: BoolArray, like: dict[str, ScoreMap] | None) -> dict[str, ScoreMap]:
         maps = {}
@@ -259,6 +296,21 @@ class CalibrationStudy:
                 right = self.lidar.right[places[rows]]
                 found[name] = fit_evidence(weighed.table[rows], right, recovered=recovered)
         return found
+
+
+@dataclass(frozen=True)
+class _StandingLines:
+    """Lines of result files, of the boxes that stand for their cluster only."""
+
+    source: Any
+    standing: Mapping[str, BoolArray]
+    study: CalibrationStudy
+
+    def objects(self, frame: Frame) -> Any:
+        """The lines of one frame."""
+        lines = self.source.objects(frame)
+        own = np.isin(lines.class_names, self.study.config.class_names) & lines.has_box3d
+        return lines[np.flatnonzero(own)[self.standing[frame.id]]]
 
 
 def _assessed(

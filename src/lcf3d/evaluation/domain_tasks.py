@@ -24,8 +24,8 @@ from lcf3d.evaluation.domain_shift import (
 from lcf3d.frame import Frame
 from lcf3d.fusion.config import FusionConfig
 from lcf3d.fusion.pipeline import LateCascadeFusion
-from lcf3d.run.setup import find_calibration
 from lcf3d.run.sources import DetectorOnFrames, LidarOnScans, open_cameras, open_lidar
+from lcf3d.run.teaching import find_calibration
 from lcf3d.structures import KITTI_CLASSES, NUSCENES_CLASSES, Camera, Detections2D, Detections3D
 
 FRONT = {"kitti": "left", "nuscenes": "CAM_FRONT"}

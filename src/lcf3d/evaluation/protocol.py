@@ -1,19 +1,17 @@
 """What a dataset's evaluation offers, so that every verb works with every dataset.
 
-A dataset names its evaluation (`lcf3d.datasets.base.Dataset.evaluation`); `open_evaluation` finds it. The official
-protocols of KITTI, nuScenes and Argoverse 2 are evaluations; datasets without one of their own are measured by centre
-distance (`lcf3d.evaluation.distance`).
+A dataset names its evaluation (`lcf3d.datasets.base.Dataset.evaluation`); `lcf3d.evaluation.opening`
+finds it. The official protocols of KITTI, nuScenes and Argoverse 2 are evaluations; datasets without one of their own
+are measured by centre distance (`lcf3d.evaluation.distance`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
-from importlib import import_module
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
-from lcf3d.datasets.base import Dataset
 from lcf3d.errors import ConfigError
 from lcf3d.evaluation.bootstrap import Interval
 from lcf3d.evaluation.study import Study
@@ -137,35 +135,6 @@ class Evaluation(Protocol):
     def compare(self, first: Any, second: Any, samples: int, seed: int) -> list[ComparisonRow]:
         """Two result sets of this evaluation, with bootstrap intervals over frames."""
         ...
-
-
-def open_evaluation(
-    dataset: Dataset, frame_ids: Sequence[str] | None = None, options: EvaluationOptions = EvaluationOptions()
-) -> Evaluation:
-    """The evaluation that a dataset names.
-
-    Args:
-        dataset: with labels.
-        frame_ids: frames to evaluate; those that the protocol takes by itself without them.
-        options: what was asked for.
-
-    Raises:
-        ConfigError: an option that the evaluation does not know.
-        DatasetError: frames without labels.
-    """
-    module, _, name = dataset.evaluation.partition(":")
-    kind = getattr(import_module(module), name)
-    if options.nds_hat and not getattr(kind, "has_nds_hat", False):
-        # NDS^ is measured in the front camera's view, which is all that KITTI annotates
-        kind = import_module("lcf3d.evaluation.distance").DistanceEvaluation
-        options = replace(options, front=True)
-    evaluation: Evaluation = kind(dataset, frame_ids, options)
-    return evaluation
-
-
-def usual_frames(dataset: Dataset) -> tuple[str, ...]:
-    """The frames that the protocol of a dataset takes by itself, for example those of KITTI's ``val``."""
-    return open_evaluation(dataset).frame_ids
 
 
 def refuse_options(what: str, options: EvaluationOptions, *names: str) -> None:

@@ -142,7 +142,8 @@ def _distance_section(studies: Sequence[Study]) -> list[Section]:
         columns = ["class" + _of(study, studies)]
         columns += [f"{near:g} m and more" if far == float("inf") else f"{near:g} to {far:g} m" for near, far in ranges]
         rows: list[tuple[str, ...] | None] = [
-            (part.class_name, *(f"{row.ap:.2f} ({row.objects})" for row in part.distance)) for part in parts
+            (part.class_name, *(f"{row.ap:.2f} ({row.objects})" if row.objects else "- (0)" for row in part.distance))
+            for part in parts
         ]
         tables.append(TableData("", tuple(columns), rows))
     return [Section("By distance", tables, "In brackets the number of objects.")] if tables else []

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
+from socket import SO_REUSEADDR, SOL_SOCKET, socket
 from typing import Any
 
 from lcf3d.datasets.base import Dataset
@@ -14,6 +16,7 @@ HOST = "127.0.0.1"
 """The only address that is served: nobody else's machine can ask."""
 # everything that the page holds is on this machine, so that only the browser's memory limits it
 _LIMIT_BYTES = 200_000_000
+_MISSING = "serve needs starlette and uvicorn: pip install 'lcf3d[serve]'"
 
 
 def report_app(results: ResultSet, dataset: Dataset, origin: dict[str, str]) -> Any:
@@ -36,7 +39,7 @@ def report_app(results: ResultSet, dataset: Dataset, origin: dict[str, str]) -> 
         from starlette.responses import HTMLResponse, JSONResponse
         from starlette.routing import Route
     except ImportError:
-        raise ConfigError("serve needs starlette and uvicorn: pip install 'lcf3d[serve]'") from None
+        raise ConfigError(_MISSING) from None
     study = results.study()
     data = report_data([study], dataset, 0, _LIMIT_BYTES)
     page = render(
@@ -58,22 +61,29 @@ def report_app(results: ResultSet, dataset: Dataset, origin: dict[str, str]) -> 
     return Starlette(routes=[Route("/", index), Route("/picture", picture)], middleware=[hosts])
 
 
-def serve(app: Any, port: int) -> None:
-    """Serve an application until interrupted.
+def listen(port: int) -> socket:
+    """A socket that waits for browsers at a port of this machine; 0 takes any free one.
 
     Raises:
         ConfigError: uvicorn is not installed, or the port is in use.
     """
-    import socket
-
+    if find_spec("uvicorn") is None or find_spec("starlette") is None:
+        raise ConfigError(_MISSING)
+    listening = socket()
+    listening.setsockopt(SOL_SOCKET, SO_REUSEADDR, 1)
     try:
-        import uvicorn
-    except ImportError:
-        raise ConfigError("serve needs starlette and uvicorn: pip install 'lcf3d[serve]'") from None
-    with socket.socket() as listening:
-        listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            listening.bind((HOST, port))
-        except OSError as error:
-            raise ConfigError(f"port {port} of {HOST} cannot be used ({error.strerror}); pass another --port") from None
+        listening.bind((HOST, port))
+        # from now on browsers wait for an answer, and others find the port taken
+        listening.listen()
+    except OSError as error:
+        listening.close()
+        raise ConfigError(f"port {port} of {HOST} cannot be used ({error.strerror}); pass another --port") from None
+    return listening
+
+
+def serve(app: Any, listening: socket) -> None:
+    """Serve an application until interrupted."""
+    import uvicorn
+
+    with listening:
         uvicorn.Server(uvicorn.Config(app, log_level="warning")).run(sockets=[listening])

@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -181,6 +182,17 @@ def _reading(path: Path, what: str = "bag") -> Iterator[None]:
         raise FormatError(f"{path}: a {what} cannot be read, it is cut off or no bag ({reason})") from None
 
 
+def require_writer(name: str) -> None:
+    """See that a bag of that name can be written, before there is anything to write.
+
+    Raises:
+        MissingExtraError: rosbags or mcap is not installed.
+    """
+    for package in ("rosbags", *(("mcap",) if name.endswith(".mcap") else ())):
+        if find_spec(package) is None:
+            raise MissingExtraError(package, "bag", f"writing {name}")
+
+
 class BagWriter:
     """Writes a bag: a single ``.mcap`` file, a ROS 1 ``.bag``, or a rosbag2 folder (sqlite3).
 
@@ -193,6 +205,7 @@ class BagWriter:
     """
 
     def __init__(self, path: Path) -> None:
+        require_writer(path.name)
         if path.exists():
             raise ConfigError(f"{path} exists; choose another place for the bag")
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -201,10 +214,8 @@ class BagWriter:
         self._channels: dict[str, Any] = {}
         self._file: Any = None
         if self.form == "mcap":
-            try:
-                from mcap.writer import Writer
-            except ImportError:
-                raise MissingExtraError("mcap", "bag", "writing .mcap files") from None
+            from mcap.writer import Writer
+
             self._file = path.open("wb")
             self._writer: Any = Writer(self._file)
             self._writer.start(profile="ros2", library="lcf3d")

@@ -199,8 +199,8 @@ def read_folder(folder: Path, frame_ids: Sequence[str], results: bool, missing: 
     folder = Path(folder)
     if not folder.is_dir():
         raise DatasetError(f"{folder} is not a folder; expected KITTI text files, one a frame")
-    present = {entry.name for entry in os.scandir(folder)}
-    absent = [frame_id for frame_id in frame_ids if f"{frame_id}.txt" not in present]
+    # asked one by one: a part of a run must not list the files of all others
+    absent = [frame_id for frame_id in frame_ids if not os.path.exists(f"{folder}/{frame_id}.txt")]
     if absent and missing == "error":
         raise DatasetError(
             f"{folder} lacks the files of {len(absent)} of {len(frame_ids)} frames, first {absent[0]}.txt; "

@@ -13,7 +13,7 @@ from lcf3d.frame import Frame
 from lcf3d.fusion.config import FusionConfig
 from lcf3d.provenance import Decisions
 from lcf3d.reasons import Reason
-from lcf3d.structures import Camera, Detections2D, Detections3D, IntArray
+from lcf3d.structures import Camera, Detections, Detections2D, Detections3D, IntArray
 
 
 class Branches(NamedTuple):
@@ -95,16 +95,21 @@ def prepare_branches(
         who = f"frame {frame.id}, camera {view.name}:"
         chosen.append(_select(found, names, config.camera_score_threshold, table.reason[rows], who))
     return Branches(
-        lidar=lidar[lidar_index].with_classes(names),
+        lidar=_taken(lidar, lidar_index).with_classes(names),
         lidar_index=lidar_index,
         cameras=tuple(cameras),
-        camera=tuple(found[index].with_classes(names) for found, index in zip(given, chosen, strict=True)),
+        camera=tuple(_taken(found, index).with_classes(names) for found, index in zip(given, chosen, strict=True)),
         camera_index=tuple(chosen),
         camera_start=tuple(start[:-1]),
         lidar_table=lidar_table,
         camera_table=table,
         notes=tuple(notes),
     )
+
+
+def _taken(detections: Detections, index: IntArray) -> Detections:
+    """Those of ``index``, which rises; nothing is copied where it is all of them."""
+    return detections if len(index) == len(detections) else detections[index]
 
 
 def _select(
@@ -128,12 +133,13 @@ def _select(
                 f"{list(names)}; map them with Detections.with_classes"
             )
         of_class = np.array([name in names for name in detections.class_names], dtype=bool)[detections.labels]
-        reason[~of_class] = Reason.OTHER_CLASS
+        reason[~of_class] = Reason.OTHER_CLASS.value
         takes_part &= of_class
     sides = boxes[:, 3:6] if isinstance(detections, Detections3D) else boxes[:, 2:] - boxes[:, :2]
-    if not (np.isfinite(boxes).all() and (sides > 0).all()):
+    # one bad value spoils the sum, and NaN is not above 0
+    if not (np.isfinite(boxes.sum()) and sides.min() > 0):
         valid = np.isfinite(boxes).all(axis=1) & (sides > 0).all(axis=1)
-        reason[~valid] = Reason.INVALID
+        reason[~valid] = Reason.INVALID.value
         takes_part &= valid
     return takes_part.nonzero()[0]
 
@@ -143,6 +149,6 @@ def _cap(lidar: Detections3D, index: IntArray, table: Decisions, max_boxes: int)
     if len(index) <= max_boxes:
         return index
     order = np.argsort(-lidar.scores[index], kind="stable")
-    table.reason[index[order[max_boxes:]]] = Reason.TOO_MANY
+    table.reason[index[order[max_boxes:]]] = Reason.TOO_MANY.value
     kept: IntArray = np.sort(index[order[:max_boxes]])
     return kept

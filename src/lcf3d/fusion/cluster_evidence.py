@@ -50,35 +50,33 @@ def gather_evidence(
     calibration: Calibration,
 ) -> ClusterEvidence:
     """Collect the evidence for every cluster, represented by the LiDAR detections ``box``."""
-    lidar = branches.lidar[box]
-    camera_scores, labels = np.zeros(len(box)), lidar.labels.copy()
+    boxes, scores, own = branches.lidar.boxes[box], branches.lidar.scores[box], branches.lidar.labels[box]
+    camera_scores, labels = np.zeros(len(box)), own.copy()
     exposure = np.zeros(len(box))
     for c, (view, found, camera) in enumerate(zip(views, branches.camera, branches.cameras, strict=True)):
         here = matches.camera == c
         camera_scores[here] = found.scores[matches.detection[here]]
         labels[here] = found.labels[matches.detection[here]]
-        plain = miss_exposure(view.boxes[box], camera.width, camera.height)
-        plain[~view.visible | cut_by_field(view.boxes[box], camera)] = 0.0
+        projected = view.boxes[box]
+        plain = miss_exposure(projected, camera.width, camera.height)
+        plain[~view.visible] = 0.0
+        if camera.distortion is not None:
+            plain[cut_by_field(projected, camera)] = 0.0
         np.maximum(exposure, plain, out=exposure)
     table = evidence_table(
-        to_log_odds(lidar.scores),
-        competing_scores(lidar.boxes, lidar.scores, lidar.labels, config),
-        ground_slope(lidar.boxes, calibration.ground_z),
+        to_log_odds(scores),
+        competing_scores(boxes, scores, own, config),
+        ground_slope(boxes, calibration.ground_z),
         exposure,
         camera_scores,
         np.where(matches.camera >= 0, matches.iou, 0.0),
     )
-    return ClusterEvidence(box, table, lidar.labels, labels == lidar.labels)
+    return ClusterEvidence(box, table, own, labels == own)
 
 
-def fused_scores(weighed: ClusterEvidence, weights: Sequence[FloatArray]) -> FloatArray:
-    """(C,) probability of every cluster, by the weights of its class."""
-    log_odds = np.zeros(len(weighed.box))
-    for label, own_weights in enumerate(weights):
-        own = weighed.labels == label
-        if own.any():
-            log_odds[own] = weighed.table[own] @ own_weights
-    return to_probability(log_odds)
+def fused_scores(weighed: ClusterEvidence, weights: FloatArray) -> FloatArray:
+    """(C,) probability of every cluster, by the weights of its class, which are (L, 9)."""
+    return to_probability((weighed.table * weights[weighed.labels]).sum(axis=1))
 
 
 def evidence_of(name: str, config: FusionConfig, calibration: Calibration) -> Evidence:

@@ -72,8 +72,8 @@ def decide_clusters(
     matched = np.flatnonzero(matches.camera >= 0)
     camera_scores, camera_labels = _matched_detections(branches, matches, matched)
     scores, labels = lidar.scores[box], lidar.labels[box]
-    outcome = np.full(len(box), Outcome.KEPT, dtype=np.int64)
-    reason = np.full(len(box), Reason.UNCONFIRMED, dtype=np.int64)
+    outcome = np.full(len(box), Outcome.KEPT.value, dtype=np.int64)
+    reason = np.full(len(box), Reason.UNCONFIRMED.value, dtype=np.int64)
 
     agreed = labels[matched] == camera_labels
     if config.ensemble != "none":
@@ -86,20 +86,20 @@ def decide_clusters(
         )
     if weighed is not None:
         scores[matched[agreed]] = weighed[matched[agreed]]
-    outcome[matched], reason[matched] = Outcome.MATCHED, Reason.CONFIRMED
+    outcome[matched], reason[matched] = Outcome.MATCHED.value, Reason.CONFIRMED.value
 
     unseen = ~matches.visible
     unseen[matched] = False
-    reason[unseen] = Reason.OUT_OF_VIEW
+    reason[unseen] = Reason.OUT_OF_VIEW.value
     # with no camera at all nobody could look: the LiDAR branch then stands alone
     if config.out_of_view == "drop" and branches.cameras:
-        outcome[unseen] = Outcome.DROPPED
-    reason[matches.visible & ~judged] = Reason.CLASS_NOT_DETECTED
+        outcome[unseen] = Outcome.DROPPED.value
+    reason[matches.visible & ~judged] = Reason.CLASS_NOT_DETECTED.value
     unconfirmed = matches.visible & judged & (matches.camera < 0)
     if config.unmatched == "drop":
-        outcome[unconfirmed] = Outcome.DROPPED
+        outcome[unconfirmed] = Outcome.DROPPED.value
     elif config.unmatched == "downweight":
-        reason[unconfirmed] = Reason.DOWNWEIGHTED
+        reason[unconfirmed] = Reason.DOWNWEIGHTED.value
         scores[unconfirmed] = (
             fuse_scores(scores, np.array(config.miss_likelihood), np.array(0.5))[unconfirmed]
             if weighed is None
@@ -126,23 +126,44 @@ def _best_of_class(lidar: Detections3D, clusters: Clusters, cluster: int, label:
     return int(members[np.argmax(lidar.scores[members])])
 
 
-def replace_unconfirmed(
+def settle_doubles(
     decisions: ClusterDecisions, lidar: Detections3D, recovery: Recovery, duplicate_iou: float
-) -> ClusterDecisions:
-    """Drop clusters kept without confirmation on whose spot a recovered box stands: one object comes out once."""
-    if not len(recovery.found):
-        return decisions
+) -> tuple[ClusterDecisions, Recovery]:
+    """One object comes out once: where a recovered box stands on a cluster kept without confirmation, the better stays.
+
+    Better is the higher score. A camera that has turned finds every object beside its LiDAR box: a recovered box of
+    0.35 must not take the place of a LiDAR box of 0.98.
+
+    Args:
+        decisions: of the clusters.
+        lidar: what takes part.
+        recovery: its ``scores`` on the scale of the decisions'.
+        duplicate_iou: BEV IoU above which two boxes are one object.
+
+    Returns:
+        The decisions, clusters that give way dropped as ``REPLACED``; the recovery, boxes that do as ``DUPLICATE``.
+    """
+    found = recovery.found
+    if not len(found):
+        return decisions, recovery
     kept = np.flatnonzero(
-        np.isin(decisions.reason, [Reason.UNCONFIRMED, Reason.DOWNWEIGHTED, Reason.CLASS_NOT_DETECTED])
+        np.isin(
+            decisions.reason, [Reason.UNCONFIRMED.value, Reason.DOWNWEIGHTED.value, Reason.CLASS_NOT_DETECTED.value]
+        )
+        & (decisions.outcome == Outcome.KEPT.value)
     )
-    kept = kept[decisions.outcome[kept] == Outcome.KEPT]
     if not len(kept):
-        return decisions
-    overlap = bev_iou(lidar.boxes[decisions.box[kept]], recovery.boxes[recovery.found])
-    gone = kept[(overlap > duplicate_iou).any(axis=1)]
+        return decisions, recovery
+    double = bev_iou(lidar.boxes[decisions.box[kept]], recovery.boxes[found]) > duplicate_iou
+    better = decisions.scores[kept][:, None] >= recovery.scores[found][None]
+    doubles = found[(double & better).any(axis=0)]
+    reasons = recovery.reason.copy()
+    reasons[doubles] = Reason.DUPLICATE.value
+    # a recovered box that gave way to one cluster takes the place of no other
+    gone = kept[(double & ~better & ~np.isin(found, doubles)[None]).any(axis=1)]
     outcomes, reason = decisions.outcome.copy(), decisions.reason.copy()
-    outcomes[gone], reason[gone] = Outcome.DROPPED, Reason.REPLACED
-    return decisions._replace(outcome=outcomes, reason=reason)
+    outcomes[gone], reason[gone] = Outcome.DROPPED.value, Reason.REPLACED.value
+    return decisions._replace(outcome=outcomes, reason=reason), recovery._replace(reason=reasons)
 
 
 def assemble(
@@ -157,7 +178,7 @@ def assemble(
     camera_inputs: tuple[Detections2D, ...],
 ) -> FusedDetections:
     """Output detections, highest score first, and the reason for every input."""
-    surviving = (decisions.outcome != Outcome.DROPPED).nonzero()[0]
+    surviving = (decisions.outcome != Outcome.DROPPED.value).nonzero()[0]
     found = recovery.found
     detections = with_columns(
         branches.lidar[decisions.box[surviving]],
@@ -193,12 +214,12 @@ def _write_lidar_rows(
     """Fill the rows of the 3D detections that took part."""
     table, rows = branches.lidar_table, branches.lidar_index
     table.cluster[rows] = clusters.index
-    table.reason[rows] = np.where(clusters.index == SUPPRESSED, Reason.SUPPRESSED, Reason.IN_CLUSTER)
+    table.reason[rows] = np.where(clusters.index == SUPPRESSED, Reason.SUPPRESSED.value, Reason.IN_CLUSTER.value)
     own = rows[decisions.box]
     table.outcome[own], table.reason[own] = decisions.outcome, decisions.reason
     table.camera[own], table.iou[own] = matches.camera, matches.iou
     table.output[own] = cluster_output
-    lasting = decisions.outcome != Outcome.DROPPED
+    lasting = decisions.outcome != Outcome.DROPPED.value
     table.score[own[lasting]] = decisions.scores[lasting]
     for c, chosen in enumerate(branches.camera_index):
         here = matches.camera == c
@@ -216,8 +237,8 @@ def _write_camera_rows(
         detection = view.match[cluster]
         rows = start + chosen[detection]
         primary = (matches.camera[cluster] == c) & (matches.detection[cluster] == detection)
-        table.outcome[rows] = Outcome.MATCHED
-        table.reason[rows] = np.where(primary, Reason.CONFIRMED, Reason.OTHER_VIEW)
+        table.outcome[rows] = Outcome.MATCHED.value
+        table.reason[rows] = np.where(primary, Reason.CONFIRMED.value, Reason.OTHER_VIEW.value)
         table.cluster[rows] = cluster
         table.lidar[rows] = branches.lidar_index[decisions.box[cluster]]
         table.lidar_score[rows] = branches.lidar.scores[decisions.box[cluster]]
@@ -241,7 +262,7 @@ def _write_recovery_rows(branches: Branches, recovery: Recovery, outputs: IntArr
     for rows, own, iou in ((first, every, recovery.iou), (second, paired, recovery.second_iou[paired])):
         table.reason[rows], table.iou[rows], table.quality[rows] = recovery.reason[own], iou, recovery.quality[own]
         found = output[own] >= 0
-        table.outcome[rows[found]] = Outcome.RECOVERED
+        table.outcome[rows[found]] = Outcome.RECOVERED.value
         table.score[rows[found]], table.output[rows[found]] = recovery.scores[own[found]], output[own[found]]
 
 

@@ -12,11 +12,13 @@ where ``s2d`` and the image IoU are those of the matched 2D detection (zero with
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Any
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from lcf3d.kernels import kernel
 from lcf3d.structures import FloatArray
 
 Weight = Annotated[float, Field(ge=0)]
@@ -132,11 +134,30 @@ def evidence_table(
         iou: (N,) image IoU with it, 0 without one.
     """
     table = np.ones((len(iou), 9))
-    table[:, 0], table[:, 1], table[:, 2] = log_odds, -competing, -slope
-    table[:, 3] = -np.where(iou > 0, 0.0, exposure)
-    low, high = np.array((0.0, *SUPPORT_IOU[:-1])), np.array(SUPPORT_IOU)
-    table[:, 4:8] = camera_scores[:, None] * _within((iou[:, None] - low) / (high - low), 0, 1)
+    table[:, 0], table[:, 1], table[:, 2], table[:, 3], table[:, 4], table[:, 5] = (
+        log_odds,
+        competing,
+        slope,
+        exposure,
+        camera_scores,
+        iou,
+    )
+    _weigh(table)
     return table
+
+
+@kernel
+def _weigh(table):  # type: ignore[no-untyped-def]
+    """Turn the six inputs of `evidence_table`, in the first columns, into its columns, in place."""
+    for n in range(len(table)):
+        score, iou = table[n, 4], table[n, 5]
+        table[n, 1], table[n, 2] = -table[n, 1], -table[n, 2]
+        table[n, 3] = 0.0 if iou > 0 else -table[n, 3]
+        low = 0.0
+        for k in range(len(SUPPORT_IOU)):
+            share = (iou - low) / (SUPPORT_IOU[k] - low)
+            table[n, 4 + k] = score * min(max(share, 0.0), 1.0)
+            low = SUPPORT_IOU[k]
 
 
 def miss_exposure(projected: FloatArray, width: int, height: int) -> FloatArray:
@@ -150,10 +171,21 @@ def miss_exposure(projected: FloatArray, width: int, height: int) -> FloatArray:
         width: image width in pixels.
         height: image height in pixels.
     """
+    # a copy in C order, so that one compiled version serves all
+    exposure: FloatArray = _exposure(np.array(projected, dtype=np.float64, order="C"), width, height)
+    return exposure
+
+
+@kernel
+def _exposure(projected, width, height):  # type: ignore[no-untyped-def]
+    """See `miss_exposure`."""
+    exposure = np.zeros(len(projected))
     low, high = EXPOSURE_HEIGHTS_PX
-    tall = np.log(np.maximum(projected[:, 3] - projected[:, 1], 1.0) / low) / np.log(high / low)
-    cut = (projected[:, 0] <= 1) | (projected[:, 2] >= width - 2) | (projected[:, 3] >= height - 2)
-    return np.where(cut, 0.0, _within(tall, 0, 1))
+    for n in range(len(projected)):
+        if projected[n, 0] > 1 and projected[n, 2] < width - 2 and projected[n, 3] < height - 2:
+            tall = math.log(max(projected[n, 3] - projected[n, 1], 1.0) / low) / math.log(high / low)
+            exposure[n] = min(max(tall, 0.0), 1.0)
+    return exposure
 
 
 def ground_slope(boxes: FloatArray, ground_z: float | None) -> FloatArray:

@@ -194,13 +194,18 @@ def merge_views(views: Sequence[View], cluster_count: int) -> Matches:
     best = np.full(cluster_count, np.nan)
     visible = np.zeros(cluster_count, dtype=bool)
     for v, view in enumerate(views):
-        visible |= view.visible
-        matched = (view.match >= 0).nonzero()[0]
-        iou = view.iou[matched, view.match[matched]]
-        better = ~(iou <= best[matched])  # also where there is none yet
-        rows = matched[better]
-        camera[rows], detection[rows], best[rows] = v, view.match[rows], iou[better]
+        _merge(v, view.visible, view.match, view.iou, camera, detection, best, visible)
     return Matches(camera, detection, best, visible)
+
+
+@kernel
+def _merge(v, seen, match, iou, camera, detection, best, visible):  # type: ignore[no-untyped-def]
+    """Take in what camera ``v`` says of the clusters, see `merge_views`."""
+    for c in range(len(match)):
+        visible[c] = visible[c] or seen[c]
+        # not best at all where there is none yet
+        if match[c] >= 0 and not iou[c, match[c]] <= best[c]:
+            camera[c], detection[c], best[c] = v, match[c], iou[c, match[c]]
 
 
 def confirmed_elsewhere(

@@ -21,7 +21,7 @@ import numpy as np
 from lcf3d.errors import ConfigError
 from lcf3d.frame import Frame
 from lcf3d.fusion.memory_config import MemoryConfig
-from lcf3d.fusion.memory_ego import estimate_pose
+from lcf3d.fusion.memory_ego import FIRST_ODOMETRY, estimate_pose, stretched
 from lcf3d.fusion.memory_state import Memory, Moment, Tracks
 from lcf3d.fusion.memory_step import aged, step
 from lcf3d.geometry.rotation import invert_rigid
@@ -77,6 +77,7 @@ def remember(
             time_s=frame.timestamp,
             world_from_lidar=np.eye(4),
             world_from_dataset=None if frame.world_from_lidar is None else invert_rigid(frame.world_from_lidar),
+            odometry=FIRST_ODOMETRY,
             ego_velocity=None,
             cameras=cameras,
             next_id=0 if memory is None else memory.next_id,
@@ -89,7 +90,9 @@ def remember(
     elapsed = frame.timestamp - memory.time_s
     tracks = aged(memory, elapsed)
     pose, velocity = _given_pose(memory, frame), None
-    if pose is None:
+    if pose is not None:
+        pose = stretched(pose, memory.world_from_lidar, memory.odometry.scale)
+    else:
         pose, velocity = estimate_pose(
             tracks, detections.boxes, detections.labels, memory.world_from_lidar, memory.ego_velocity, elapsed
         )

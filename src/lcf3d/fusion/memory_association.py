@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from lcf3d.fusion.memory_motion import POSITION_NOISE, POSITION_NOISE_BY_DISTANCE
-from lcf3d.fusion.memory_state import COV, LABEL, POSITION_X, POSITION_Y, Tracks
+from lcf3d.fusion.memory_motion import POSITION_NOISE, POSITION_NOISE_BY_DISTANCE, place
+from lcf3d.fusion.memory_state import LABEL, Tracks
 from lcf3d.kernels import kernel
 from lcf3d.structures import FloatArray, IntArray
 
@@ -42,13 +42,12 @@ def associate(
 @kernel
 def _costs(values, numbers, boxes, labels, distances, reach, cost):  # type: ignore[no-untyped-def]
     """Fill ``cost`` (N, T): squared Mahalanobis distance less that of the gate; 0 stays for pairs that are none."""
-    for i in range(len(boxes)):
-        noise = POSITION_NOISE + POSITION_NOISE_BY_DISTANCE * distances[i]
-        longest = reach[labels[i]] * reach[labels[i]]
-        for j in range(len(values)):
+    for j in range(len(values)):
+        x, y, variance = place(values[j])
+        for i in range(len(boxes)):
             if labels[i] != numbers[j, LABEL]:
                 continue
-            x, y = boxes[i, 0] - values[j, POSITION_X], boxes[i, 1] - values[j, POSITION_Y]
-            squared = x * x + y * y
-            if squared < longest:
-                cost[i, j] = min(squared / (values[j, COV] + noise * noise) - GATE * GATE, 0.0)
+            noise = POSITION_NOISE + POSITION_NOISE_BY_DISTANCE * distances[i]
+            squared = (boxes[i, 0] - x) ** 2 + (boxes[i, 1] - y) ** 2
+            if squared < reach[labels[i]] * reach[labels[i]]:
+                cost[i, j] = min(squared / (variance + noise * noise) - GATE * GATE, 0.0)

@@ -94,7 +94,7 @@ class MemoryConfig(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     classes: dict[str, ClassMemory] = Field(default_factory=dict)
-    horizon_s: Positive = 1.05
+    horizon_s: Positive = 2.05
     max_gap_s: Positive = 1.05
     max_tracks: int = Field(default=300, ge=1)
     min_hits: int = Field(default=2, ge=1)

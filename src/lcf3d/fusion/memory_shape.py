@@ -36,7 +36,7 @@ def reshape(track, box, weight, bottom_share):  # type: ignore[no-untyped-def]
     """Average a track's sizes with those of a measured box, and steady its bottom (numba).
 
     Args:
-        track: (21,) row of `Tracks.values`; changed in place.
+        track: (25,) row of `Tracks.values`; changed in place.
         box: (7,) measured, upright as the world is.
         weight: `size_weight` of the box.
         bottom_share: see there.

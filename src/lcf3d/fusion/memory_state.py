@@ -36,7 +36,11 @@ ID, LABEL, HITS = range(3)
     LAST_SUPPORT,
     BORN,
     SEEN,
-) = range(21)
+    STANDING_X,
+    STANDING_Y,
+    STANDING_COV,
+    STANDING,
+) = range(25)
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +51,8 @@ class Tracks:
 
     Attributes:
         numbers: (T, 3) id, never used again within a sequence; class; number of frames that saw the object.
-        values: (T, 21) in the order of the properties below.
+        values: (T, 25): position and velocity if the object moves, and what the properties below name; last, position
+            and variance if it stands, and how probable that is.
     """
 
     numbers: IntArray
@@ -56,7 +61,7 @@ class Tracks:
     @classmethod
     def empty(cls) -> Tracks:
         """No tracks."""
-        return cls(np.zeros((0, 3), dtype=np.int64), np.zeros((0, 21)))
+        return cls(np.zeros((0, 3), dtype=np.int64), np.zeros((0, 25)))
 
     def __len__(self) -> int:
         return len(self.numbers)
@@ -82,18 +87,32 @@ class Tracks:
 
     @property
     def positions(self) -> FloatArray:
-        """(T, 2) x and y of the centre."""
+        """(T, 2) x and y of the centre: where it is if it stands or if it moves, whichever is more probable."""
+        likelier: FloatArray = np.where(
+            self.standing[:, None] > 0.5, self.values[:, STANDING_X:STANDING_COV], self.moving_positions
+        )
+        return likelier
+
+    @property
+    def moving_positions(self) -> FloatArray:
+        """(T, 2) x and y of the centre if it moves."""
         return self.values[:, :VELOCITY_X]
 
     @property
-    def velocities(self) -> FloatArray:
-        """(T, 2) m/s."""
-        return self.values[:, VELOCITY_X:COV]
+    def standing(self) -> FloatArray:
+        """(T,) probability that it stands."""
+        return self.values[:, STANDING]
 
     @property
-    def position_cov(self) -> FloatArray:
-        """(T, 3) of the filter along either axis: variance of position, covariance, variance of velocity."""
-        return self.values[:, COV:HEADING]
+    def velocities(self) -> FloatArray:
+        """(T, 2) m/s; what stands has none."""
+        mean: FloatArray = (1 - self.standing)[:, None] * self.values[:, VELOCITY_X:COV]
+        return mean
+
+    @property
+    def position_variances(self) -> FloatArray:
+        """(T,) of the position along either axis, if the object moves."""
+        return self.values[:, COV]
 
     @property
     def yaws(self) -> FloatArray:
@@ -141,6 +160,18 @@ class Tracks:
         return boxes
 
 
+class Odometry(NamedTuple):
+    """How long the poses' steps really are.
+
+    Attributes:
+        scale: true length of a step by that of the poses.
+        variance: of the scale.
+    """
+
+    scale: float
+    variance: float
+
+
 @dataclass(frozen=True, eq=False)
 class Memory:
     """What is kept from frame to frame; of bounded size.
@@ -150,7 +181,9 @@ class Memory:
         time_s: when the last frame was.
         world_from_lidar: (4, 4) where the sensor was then. The memory's world is the LiDAR frame of its first frame,
             so that z is up whatever the axes of the dataset's world.
-        world_from_dataset: (4, 4) from the fixed frame of the dataset's poses; None where it has none.
+        world_from_dataset: (4, 4) from the fixed frame of the dataset's poses; None where it has none. It moves
+            along as the scale of the poses' steps is corrected.
+        odometry: what is known of that scale.
         ego_velocity: (3,) the sensor's, ahead and left, m/s, and yaw rate, where it was estimated from the objects;
             None where the pose was given or nothing is known yet.
         cameras: what looked then; empty for nothing but the LiDAR.
@@ -165,6 +198,7 @@ class Memory:
     time_s: float
     world_from_lidar: FloatArray
     world_from_dataset: FloatArray | None
+    odometry: Odometry
     ego_velocity: FloatArray | None
     cameras: tuple[Camera, ...]
     next_id: int

@@ -10,6 +10,7 @@ import numpy as np
 from lcf3d.fusion.evidence import to_log_odds, to_probability
 from lcf3d.fusion.memory_association import associate
 from lcf3d.fusion.memory_config import MemoryConfig
+from lcf3d.fusion.memory_ego import learned_odometry
 from lcf3d.fusion.memory_evidence import CAMERA, HIDDEN, frame_support, missed_log_odds, seen_log_odds
 from lcf3d.fusion.memory_motion import begin, measure, predict
 from lcf3d.fusion.memory_prediction import free_camera_scores, free_share, hidden_share, seen_by, views_of
@@ -27,6 +28,7 @@ from lcf3d.fusion.memory_state import (
     SUPPORT,
     Memory,
     Moment,
+    Odometry,
     Tracks,
 )
 from lcf3d.geometry.boxes import transform_boxes
@@ -97,7 +99,10 @@ def step(memory: Memory, tracks: Tracks, fused: FusedDetections, moment: Moment)
         seen.log_odds, support, _looked(memory, seen, elapsed), classes.seen_weight[found.labels], elapsed
     )
     known, own = _updated(tracks, seen, found, memory, time)
-    tracked = transform_boxes(known.boxes, lidar_from_world)
+    places = known.boxes
+    # what is seen is made better by where it is if it moves: what stands and starts would be held back
+    places[own, :2] = known.moving_positions[own]
+    tracked = transform_boxes(places, lidar_from_world)
     kept = np.empty((len(found), 7))
     refine(np.array(found.boxes), match, classes.rigid[found.labels], tracked, kept)
     predicted = _predicted(len(tracks), known, tracked, seen, fused, moment, memory)
@@ -110,15 +115,30 @@ def step(memory: Memory, tracks: Tracks, fused: FusedDetections, moment: Moment)
         lidar_from_world,
         time,
     )
+    odometry, world_from_dataset = _odometry(memory, known, moment)
     return replace(
         memory,
         tracks=_bounded(known, time, memory.config),
         time_s=time,
         world_from_lidar=moment.world_from_lidar,
+        world_from_dataset=world_from_dataset,
+        odometry=odometry,
         ego_velocity=moment.ego_velocity,
         cameras=moment.cameras,
         next_id=memory.next_id + len(known) - len(tracks),
     ), result
+
+
+def _odometry(memory: Memory, tracks: Tracks, moment: Moment) -> tuple[Odometry, FloatArray | None]:
+    """What is known of the poses' scale after the frame, and the memory's world from theirs."""
+    given, known, world_from_dataset = moment.frame.world_from_lidar, memory.odometry, memory.world_from_dataset
+    elapsed = moment.time_s - memory.time_s
+    if given is None or world_from_dataset is None or elapsed <= 0:
+        return known, world_from_dataset
+    here, before = moment.world_from_lidar[:3, 3], memory.world_from_lidar[:3, 3]
+    moved = world_from_dataset.copy()
+    moved[:3, 3] += here - (world_from_dataset @ given)[:3, 3]
+    return learned_odometry(known, tracks, here[:2] - before[:2], moment.time_s, elapsed), moved
 
 
 def _looked(memory: Memory, seen: _Seen, elapsed_s: float) -> BoolArray:

@@ -21,7 +21,7 @@ from lcf3d.fusion.decisions import (
     assemble,
     choose_representatives,
     decide_clusters,
-    replace_unconfirmed,
+    settle_doubles,
 )
 from lcf3d.fusion.localizer import Localizer
 from lcf3d.fusion.matching import Matches, View, boxes_after, confirmed_elsewhere, match_view, merge_views
@@ -59,8 +59,10 @@ class LateCascadeFusion:
         calibration: Calibration | None = None,
         reports: Mapping[str, Collection[str]] | None = None,
     ) -> None:
-        self.reports = dict(reports or {})
         self.config = config or FusionConfig()
+        # a camera that can report all classes is one of which nothing is known
+        names = set(self.config.class_names)
+        self.reports = {camera: classes for camera, classes in (reports or {}).items() if names - set(classes)}
         unknown = unknown_classes(self.config.class_names)
         if unknown and self.config.ensemble == "evidence":
             log.warning("classes %s are unknown, treated as 'other'; give them weights with evidence", unknown)
@@ -91,7 +93,7 @@ class LateCascadeFusion:
         clusters, views, matches = self._match(branches)  # (c) bounding box matching
         decisions = self._decide(branches, clusters, views, matches)  # (e) semantic fusion
         recovery, notes = self._recover(frame, branches, clusters, views, matches, decisions)  # (d) detection recovery
-        decisions = replace_unconfirmed(decisions, branches.lidar, recovery, self.config.duplicate_iou)
+        decisions, recovery = settle_doubles(decisions, branches.lidar, recovery, self.config.duplicate_iou)
         given = tuple(camera[view.name] for view in branches.cameras)
         return assemble(branches, clusters, views, matches, decisions, recovery, notes, lidar, given)
 
@@ -156,9 +158,9 @@ class LateCascadeFusion:
         return defaultdict(partial(np.ones, len(names), dtype=bool), known)
 
     @cached_property
-    def _weights(self) -> list[FloatArray]:
-        """(9,) by class, see `Evidence.weights`."""
-        return [evidence_of(name, self.config, self.calibration).weights for name in self.config.class_names]
+    def _weights(self) -> FloatArray:
+        """(L, 9) by class, see `Evidence.weights`."""
+        return np.array([evidence_of(name, self.config, self.calibration).weights for name in self.config.class_names])
 
     def _decide(
         self, branches: Branches, clusters: Clusters, views: Sequence[View], matches: Matches
@@ -228,9 +230,11 @@ class LateCascadeFusion:
             unmatched = np.ones(len(found), dtype=bool)
             unmatched[view.match[view.match >= 0]] = False
             free = unmatched.nonzero()[0]
-            elsewhere = confirmed_elsewhere(views, matches, clusters, found.boxes[free], c, config.elsewhere_iou)
-            self._mark(branches, c, free[elsewhere], Reason.SEEN_ELSEWHERE)
-            candidates.append(free[~elsewhere])
+            if len(views) > 1:
+                elsewhere = confirmed_elsewhere(views, matches, clusters, found.boxes[free], c, config.elsewhere_iou)
+                self._mark(branches, c, free[elsewhere], Reason.SEEN_ELSEWHERE.value)
+                free = free[~elsewhere]
+            candidates.append(free)
         notes: list[str] = []
         points = None
         if config.recovery and any(len(c) for c in candidates):
@@ -238,7 +242,7 @@ class LateCascadeFusion:
             if points is None:
                 notes.append("there is no scan: unmatched camera detections could not be recovered")
         if points is None:
-            reason = Reason.NO_SCAN if config.recovery else Reason.NO_RECOVERY
+            reason = Reason.NO_SCAN.value if config.recovery else Reason.NO_RECOVERY.value
             for c, free in enumerate(candidates):
                 self._mark(branches, c, free[branches.camera[c].scores[free] > config.decisive_score], reason)
             return NOTHING, notes
@@ -278,14 +282,14 @@ class LateCascadeFusion:
 
     def _confirmed(self, branches: Branches, decisions: ClusterDecisions) -> FloatArray:
         """Boxes that a recovered one may not double: matched ones, and those kept where no camera looks."""
-        lasting = (decisions.outcome == Outcome.MATCHED) | (
-            (decisions.outcome == Outcome.KEPT) & (decisions.reason == Reason.OUT_OF_VIEW)
+        lasting = (decisions.outcome == Outcome.MATCHED.value) | (
+            (decisions.outcome == Outcome.KEPT.value) & (decisions.reason == Reason.OUT_OF_VIEW.value)
         )
         boxes: FloatArray = branches.lidar.boxes[decisions.box[lasting]]
         return boxes
 
     @staticmethod
-    def _mark(branches: Branches, camera: int, detections: IntArray, reason: Reason) -> None:
+    def _mark(branches: Branches, camera: int, detections: IntArray, reason: int) -> None:
         """Write down why 2D detections of a camera are dropped."""
         rows = branches.camera_start[camera] + branches.camera_index[camera][detections]
         branches.camera_table.reason[rows] = reason

@@ -49,7 +49,9 @@ class Recovery(NamedTuple):
     @property
     def found(self) -> IntArray:
         """Rows of the candidates that were recovered."""
-        return np.flatnonzero(self.reason == Reason.LOCALIZED)
+        if not len(self.reason):
+            return self.detection
+        return np.flatnonzero(self.reason == Reason.LOCALIZED.value)
 
 
 NOTHING = Recovery(
@@ -120,7 +122,7 @@ def recover(
     rows = np.searchsorted(_key(table.camera, table.detection), _key(proposals.camera_index, proposals.detection_index))
     table.quality[rows] = quality
     _confirm(table, rows, proposals, boxes, confirm_iou)
-    table.reason[rows[(table.reason[rows] == Reason.LOCALIZED) & (quality < min_quality)]] = Reason.POOR_FIT
+    table.reason[rows[(table.reason[rows] == Reason.LOCALIZED.value) & (quality < min_quality)]] = Reason.POOR_FIT.value
     _mark_duplicates(table, confirmed, duplicate_iou)
     return table
 
@@ -140,7 +142,9 @@ def _confirm(
         both = np.minimum(overlap, table.second_iou[rows]) >= confirm_iou
         confirmed = np.where(paired, both, confirmed)
     table.reason[rows] = np.where(
-        np.isnan(overlap), Reason.NOT_LOCALIZED, np.where(confirmed, Reason.LOCALIZED, Reason.DISAGREES)
+        np.isnan(overlap),
+        Reason.NOT_LOCALIZED.value,
+        np.where(confirmed, Reason.LOCALIZED.value, Reason.DISAGREES.value),
     )
 
 
@@ -158,7 +162,7 @@ def _candidate_table(
     table = Recovery(
         camera=np.repeat(np.arange(len(chosen)), [len(c) for c in chosen]).astype(np.int64),
         detection=np.concatenate([np.zeros(0, np.int64), *chosen]).astype(np.int64),
-        reason=np.full(count, Reason.FEW_POINTS, dtype=np.int64),
+        reason=np.full(count, Reason.FEW_POINTS.value, dtype=np.int64),
         boxes=np.full((count, 7), np.nan),
         iou=np.full(count, np.nan),
         scores=np.full(count, np.nan),
@@ -220,6 +224,6 @@ def _mark_duplicates(table: Recovery, confirmed: FloatArray, duplicate_iou: floa
     kept: list[int] = []
     for i in range(len(rows)):
         if with_confirmed[i] or among[i, kept].any():
-            table.reason[rows[i]] = Reason.DUPLICATE
+            table.reason[rows[i]] = Reason.DUPLICATE.value
         else:
             kept.append(i)

@@ -100,8 +100,8 @@ class StereoLateCascadeFusion(LateCascadeFusion):
         """
         fused = super().__call__(frame, lidar, camera)
         table = fused.camera
-        second = (table.reason == Reason.OTHER_VIEW) & (table.pair >= 0)
-        return replace(fused, camera=replace(table, reason=np.where(second, Reason.SECOND_VIEW, table.reason)))
+        second = (table.reason == Reason.OTHER_VIEW.value) & (table.pair >= 0)
+        return replace(fused, camera=replace(table, reason=np.where(second, Reason.SECOND_VIEW.value, table.reason)))
 
     def _prepare(self, frame: Frame, lidar: Detections3D, camera: Mapping[str, Detections2D]) -> Branches:
         """Both branches, the pairs checked, and a note on every pair that is not whole."""
@@ -198,7 +198,7 @@ class StereoLateCascadeFusion(LateCascadeFusion):
                 alone = np.setdiff1d(free[camera], paired)
                 alone = alone[decisive[camera][alone]]
                 if self.config.unpaired == "discard":
-                    self._mark(branches, camera, alone, Reason.UNPAIRED)
+                    self._mark(branches, camera, alone, Reason.UNPAIRED.value)
                     alone = alone[:0]
                 candidates[camera] = np.sort(np.concatenate([paired[kept], alone]))
         return [c[good[c]] for c, good in zip(candidates, decisive, strict=True)], np.concatenate(rows)

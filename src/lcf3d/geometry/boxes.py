@@ -108,16 +108,30 @@ def lidar_from_kitti(
     Returns:
         (N, 7) canonical boxes; exactly inverted by `kitti_from_lidar`.
     """
-    rotation, translation = camera_from_lidar[:3, :3], camera_from_lidar[:3, 3]
-    centres = np.array(locations, dtype=np.float64)
-    centres[:, 1] -= dimensions_hwl[:, 0] / 2
-    # the heading in the camera is (cos ry, 0, -sin ry); its x and y parts in the LiDAR frame give yaw
-    lidar_heading = np.stack([np.cos(rotation_y), -np.sin(rotation_y)], axis=1) @ _heading_map(rotation).T
-    boxes = np.empty((len(centres), 7))
-    boxes[:, :3] = (centres - translation) @ rotation  # R is orthonormal: its inverse is its transpose
-    boxes[:, LENGTH : HEIGHT + 1] = dimensions_hwl[:, [2, 1, 0]]
-    boxes[:, YAW] = wrap_angle(np.arctan2(lidar_heading[:, 1], lidar_heading[:, 0]))
+    boxes = np.empty((len(locations), 7))
+    boxes[:, :3], boxes[:, 3:6], boxes[:, 6] = locations, dimensions_hwl, rotation_y
+    _turn_kitti(boxes, np.array(camera_from_lidar, dtype=np.float64, order="C"))
     return boxes
+
+
+@kernel
+def _turn_kitti(boxes, camera_from_lidar):  # type: ignore[no-untyped-def]
+    """Turn KITTI's columns (location, height, width, length, rotation_y) into canonical ones, in place."""
+    for n in range(len(boxes)):
+        height, length, turn = boxes[n, 3], boxes[n, 5], boxes[n, 6]
+        x, z = boxes[n, 0] - camera_from_lidar[0, 3], boxes[n, 2] - camera_from_lidar[2, 3]
+        y = boxes[n, 1] - height / 2 - camera_from_lidar[1, 3]
+        for r in range(3):
+            # R is orthonormal: its inverse is its transpose
+            boxes[n, r] = x * camera_from_lidar[0, r] + y * camera_from_lidar[1, r] + z * camera_from_lidar[2, r]
+        boxes[n, 3], boxes[n, 5] = length, height
+        # the heading in the camera is (cos ry, 0, -sin ry); its x and y parts in the LiDAR frame give yaw
+        cos, sin = math.cos(turn), math.sin(turn)
+        ahead = cos * camera_from_lidar[0, 0] - sin * camera_from_lidar[2, 0]
+        aside = cos * camera_from_lidar[0, 1] - sin * camera_from_lidar[2, 1]
+        yaw = math.atan2(aside, ahead)
+        # -pi stands for pi
+        boxes[n, 6] = -math.pi if yaw >= math.pi else yaw
 
 
 def kitti_from_lidar(boxes: FloatArray, camera_from_lidar: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:

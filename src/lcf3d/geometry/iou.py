@@ -17,13 +17,27 @@ from lcf3d.structures import FloatArray
 
 def image_iou(boxes_a: FloatArray, boxes_b: FloatArray) -> FloatArray:
     """(N, M) IoU of (N, 4) and (M, 4) axis-aligned pixel boxes ``(x1, y1, x2, y2)``; 0 for empty boxes."""
-    top_left = np.maximum(boxes_a[:, None, :2], boxes_b[None, :, :2])
-    bottom_right = np.minimum(boxes_a[:, None, 2:], boxes_b[None, :, 2:])
-    sides = np.maximum(bottom_right - top_left, 0)
-    intersection = sides[..., 0] * sides[..., 1]
+    intersection = _image_intersection(boxes_a, boxes_b)
     union = image_area(boxes_a)[:, None] + image_area(boxes_b)[None] - intersection
     iou: FloatArray = np.divide(intersection, union, out=np.zeros_like(intersection), where=union > 0)
     return iou
+
+
+def image_cover(boxes_a: FloatArray, boxes_b: FloatArray) -> FloatArray:
+    """(N, M) share of each of (N, 4) pixel boxes that lies in each of (M, 4) others; 0 for empty boxes."""
+    area = image_area(boxes_a)[:, None]
+    intersection = _image_intersection(boxes_a, boxes_b)
+    cover: FloatArray = np.divide(intersection, area, out=np.zeros_like(intersection), where=area > 0)
+    return cover
+
+
+def _image_intersection(boxes_a: FloatArray, boxes_b: FloatArray) -> FloatArray:
+    """(N, M) common area of (N, 4) and (M, 4) pixel boxes."""
+    top_left = np.maximum(boxes_a[:, None, :2], boxes_b[None, :, :2])
+    bottom_right = np.minimum(boxes_a[:, None, 2:], boxes_b[None, :, 2:])
+    sides = np.maximum(bottom_right - top_left, 0)
+    intersection: FloatArray = sides[..., 0] * sides[..., 1]
+    return intersection
 
 
 def image_area(boxes: FloatArray) -> FloatArray:

@@ -27,10 +27,18 @@ CPU_SECONDS = {
     "ssn-regnet-nuscenes": 0.74,
     "centerpoint-voxel01-nuscenes": 1.14,
     "fasterrcnn-r101-kitti": 2.6,
+    "mvxnet-kitti": 1.8,
+    "bevfusion-nuscenes": 4.7,
 }
-"""Seconds a frame on two CPU cores: LiDAR networks as docs/results.md has them; an image takes 5.2 s of one core."""
+"""Seconds a frame on two CPU cores: LiDAR networks as docs/results.md has them; others half of what one core takes."""
 
-GPU_SECONDS = {"pointpillars-kitti": 0.016, "fasterrcnn-r101-kitti": 0.027, "pv-rcnn-kitti": 0.068}
+GPU_SECONDS = {
+    "pointpillars-kitti": 0.016,
+    "fasterrcnn-r101-kitti": 0.027,
+    "pv-rcnn-kitti": 0.068,
+    "mvxnet-kitti": 0.097,
+    "bevfusion-nuscenes": 0.070,
+}
 """Seconds a frame on an A100: the paper's table of complexity, and what its speeds say of PV-RCNN."""
 
 
@@ -51,7 +59,9 @@ def about(table: Table, rows: Sequence[Row]) -> str:
                     unknown.add(name)
         if known:
             more = f" and that of {', '.join(sorted(unknown))}" if unknown else ""
-            words.append(f"about {sum(known.values()):.1f} h on {place}{more}")
+            hours = sum(known.values())
+            spent_words = f"{hours:.1f} h" if hours >= 0.95 else f"{60 * hours:.0f} min"
+            words.append(f"about {spent_words} on {place}{more}")
         elif unknown:
             words.append(f"the time of {', '.join(sorted(unknown))} on {place}, not known")
     return "; ".join(words)

@@ -11,11 +11,13 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from lcf3d.datasets.base import CameraSource, LidarSource
 from lcf3d.errors import FormatError, Lcf3dError
+from lcf3d.evaluation.domain_shift import AdaptedFrames, AdaptedLidar
 from lcf3d.files import atomic_path, reading, shortened
 from lcf3d.frame import Frame
 from lcf3d.run.frames import FrameRunner
-from lcf3d.run.sources import CameraOnImages, LidarOnScans
+from lcf3d.run.sources import CameraOnImages, DetectorOnFrames, LidarOnScans
 from lcf3d.structures import Detections2D, Detections3D, InstanceMask
 
 Found = TypeVar("Found", Detections2D, Detections3D)
@@ -35,12 +37,10 @@ def keep_detections(runner: FrameRunner, lidar: str, cameras: dict[str, str], ro
         Times of the networks, those of earlier runs included.
     """
     kept = Kept()
-    if isinstance(runner.lidar, LidarOnScans):
-        runner.lidar = _KeptLidar(runner.lidar, folder / _name(lidar, root), kept)
+    runner.lidar = kept.lidar(runner.lidar, folder, lidar, root)
     for name, source in list(runner.cameras.items()):
-        if isinstance(source, CameraOnImages):
-            text = cameras.get(name) or cameras.get("*") or next(iter(cameras.values()))
-            runner.cameras[name] = _KeptCamera(source, folder / _name(text, root), kept)
+        text = cameras.get(name) or cameras.get("*") or next(iter(cameras.values()))
+        runner.cameras[name] = kept.camera(source, folder, text, root)
     return kept
 
 
@@ -49,6 +49,19 @@ class Kept:
     """Milliseconds that each detection took when it was made, by branch."""
 
     milliseconds: dict[str, list[float]] = field(default_factory=lambda: {"lidar": [], "camera": []})
+
+    def lidar(self, source: LidarSource, folder: Path, text: str, root: str) -> LidarSource:
+        """The LiDAR branch, whose network runs only where its detections are not in the folder; files stay files."""
+        folder /= _name(text, root)
+        if isinstance(source, LidarOnScans):
+            return _KeptLidar(source, folder, self)
+        if isinstance(source, DetectorOnFrames):
+            return _KeptFrames(source, folder, self)
+        return _KeptAdapted(source, folder, self) if isinstance(source, AdaptedLidar | AdaptedFrames) else source
+
+    def camera(self, source: CameraSource, folder: Path, text: str, root: str) -> CameraSource:
+        """The same of a camera branch."""
+        return _KeptCamera(source, folder / _name(text, root), self) if isinstance(source, CameraOnImages) else source
 
     def medians(self) -> dict[str, float]:
         """The median of each branch that a network stands for; the first, which warms up, does not count."""
@@ -82,6 +95,32 @@ class _KeptLidar(LidarOnScans):
         """The detections of the frame."""
         make = super().detect
         return self.kept.get("lidar", self.folder / f"{frame.id}.npz", lambda: make(frame), Detections3D)
+
+
+class _KeptFrames(DetectorOnFrames):
+    """A `DetectorOnFrames` whose detections are kept."""
+
+    def __init__(self, source: DetectorOnFrames, folder: Path, kept: Kept) -> None:
+        super().__init__(source.detector)
+        self.folder, self.kept = folder, kept
+
+    def detect(self, frame: Frame) -> Detections3D:
+        """The detections of the frame."""
+        make = super().detect
+        return self.kept.get("lidar", self.folder / f"{frame.id}.npz", lambda: make(frame), Detections3D)
+
+
+@dataclass(frozen=True)
+class _KeptAdapted:
+    """A LiDAR branch of another domain whose detections are kept."""
+
+    source: AdaptedLidar | AdaptedFrames
+    folder: Path
+    kept: Kept
+
+    def detect(self, frame: Frame) -> Detections3D:
+        """The detections of the frame."""
+        return self.kept.get("lidar", self.folder / f"{frame.id}.npz", lambda: self.source.detect(frame), Detections3D)
 
 
 class _KeptCamera(CameraOnImages):

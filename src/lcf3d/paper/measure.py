@@ -9,14 +9,16 @@ from typing import Any
 import numpy as np
 
 from lcf3d.datasets.opening import open_dataset
-from lcf3d.evaluation.protocol import EvaluationOptions, open_evaluation
+from lcf3d.errors import ConfigError
+from lcf3d.evaluation.opening import open_evaluation
+from lcf3d.evaluation.protocol import EvaluationOptions
 from lcf3d.files import read_json, write_json
 from lcf3d.paper.kept import keep_detections
-from lcf3d.paper.networks import NeedsError, branches, substitutes
+from lcf3d.paper.networks import NeedsError, substitutes
 from lcf3d.paper.shift import measure_shift
 from lcf3d.paper.splits import KITTI_VAL
 from lcf3d.paper.tables import Row, Table
-from lcf3d.paper.workplace import Measured, Workplace, root_of, run_name, settings_of
+from lcf3d.paper.workplace import Measured, Workplace, needed, root_of, run_name, settings_of
 from lcf3d.run.frames import run_frames
 from lcf3d.run.frames import total as count_frames
 from lcf3d.run.setup import RunRequest, prepare_run
@@ -38,7 +40,7 @@ def measure_row(table: Table, row: Row, place: Workplace) -> Measured:
         raise NeedsError(row.quoted or row.needs)
     if table.measure.startswith("shift"):
         return measure_shift(table, row, place)
-    lidar, camera, localizer = branches(row, place.uses, place.device)
+    lidar, camera, localizer = needed(table, row, place)
     kind = table.data[0]
     frames, notes = frames_of(kind, root_of(kind, place))
     cameras = dict.fromkeys(("left", "right") if row.stereo else ("*",), camera) if camera else {}
@@ -61,12 +63,22 @@ def measure_row(table: Table, row: Row, place: Workplace) -> Measured:
 def frames_of(kind: str, root: Path) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Frames of the paper's validation split, and a note where the data's own list is another.
 
-    KITTI trees without ``ImageSets/val.txt`` are taken to hold all 3,769; nuScenes' tables name their own split.
+    KITTI trees without ``ImageSets/val.txt`` have to hold all 3,769; nuScenes' tables name their own split.
+
+    Raises:
+        ConfigError: they do not.
+        DatasetError: there is no such dataset.
     """
     dataset = open_dataset(f"{kind}:{root}")
     if kind != "kitti":
         return open_evaluation(dataset).frame_ids, ()
     if not (root / "ImageSets" / "val.txt").is_file():
+        absent = len(set(KITTI_VAL) - set(dataset.ids))
+        if absent:
+            raise ConfigError(
+                f"{root} lacks {absent:,} of the {len(KITTI_VAL):,} frames that the paper validates on; name those to "
+                f"measure on in {root / 'ImageSets' / 'val.txt'}, one a line, or add the frames"
+            )
         return KITTI_VAL, ()
     frames = open_evaluation(dataset).frame_ids
     if set(frames) == set(KITTI_VAL):

@@ -14,11 +14,20 @@ GROUPS = {"lidar": "lcf3d.lidar_detectors", "camera": "lcf3d.camera_detectors", 
 
 # LiDAR kinds that know the setting nms; alone, a network is measured after its own suppression
 _TORCH = KINDS
-_SUPPRESSES = (*_TORCH, "shipped", "onnx-lidar")
+_TORCH_CAMERAS = ("fasterrcnn", "ddq", "detectors", "mmdet")
+_SUPPRESSES = (*(kind for kind in _TORCH if kind != "bevfusion"), "shipped", "onnx-lidar")
 
 
 class NeedsError(Lcf3dError):
-    """A row cannot be measured here; the message says what would have to be there."""
+    """A row cannot be measured here; the message says what would have to be there.
+
+    Attributes:
+        parts: each thing that would have to be there.
+    """
+
+    def __init__(self, *parts: str) -> None:
+        super().__init__("; ".join(parts))
+        self.parts = parts
 
 
 def parse_uses(items: tuple[str, ...]) -> dict[str, str]:
@@ -80,28 +89,31 @@ def branches(row: Row, uses: Mapping[str, str], device: str = "cpu") -> tuple[st
     Raises:
         NeedsError: a network's weights have no public address; all of those are named.
     """
-    found, absent = [], []
+    found: list[str] = []
+    absent: list[str] = []
     for branch in ("lidar", "camera", "localizer"):
         name = getattr(row, branch)
         try:
             found.append(spec_of(name, branch, uses) if name else "")
         except NeedsError as error:
-            absent.append(str(error))
+            absent += error.parts
     if absent:
-        raise NeedsError("; ".join(absent))
-    lidar, camera, localizer = (_with_device(spec, device) for spec in found)
+        raise NeedsError(*absent)
+    lidar, camera, localizer = (with_device(spec, device) for spec in found)
     if not row.camera and plugins.parse(lidar).kind in _SUPPRESSES:
-        lidar = _with(lidar, "nms=keep")
+        lidar = with_setting(lidar, "nms=keep")
     return lidar, camera, localizer or "geometric"
 
 
-def _with(spec: str, setting: str) -> str:
+def with_setting(spec: str, setting: str) -> str:
+    """A string that names a network, with one more setting ``name=value``."""
     return f"{spec}{'&' if '?' in spec else '?'}{setting}"
 
 
-def _with_device(spec: str, device: str) -> str:
-    by_torch = spec.partition(":")[0] in (*_TORCH, "fasterrcnn", "frustum-pointnet")
-    return _with(spec, f"device={device}") if by_torch and device != "cpu" else spec
+def with_device(spec: str, device: str) -> str:
+    """What a command would name a network with, run on a torch device where torch runs it."""
+    by_torch = spec.partition(":")[0] in (*_TORCH, *_TORCH_CAMERAS, "frustum-pointnet")
+    return with_setting(spec, f"device={device}") if by_torch and device != "cpu" else spec
 
 
 def substitutes(row: Row, uses: Mapping[str, str]) -> tuple[str, ...]:

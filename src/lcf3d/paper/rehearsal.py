@@ -8,15 +8,22 @@ from typing import Any
 
 from lcf3d.detectors.published import find_model
 from lcf3d.files import atomic_path
-from lcf3d.networks.torch import torch
+from lcf3d.networks.torch import nn, torch
 
-# the camera networks are rehearsed as the smallest one of their kind that finds the same classes
+# the camera networks are rehearsed as the smallest one that finds the same classes, on small images: file, style, masks
 _CAMERAS = {
-    "fasterrcnn-r101-kitti": (50, "kitti", False),
-    "fasterrcnn-r50-nuscenes": (50, "nuscenes", False),
-    "ddq-detr-nuscenes": (50, "nuscenes", False),
-    "detectors-nuimages": (50, "nuscenes", True),
+    "fasterrcnn-r101-kitti": ("fasterrcnn-kitti", "kitti", False),
+    "fasterrcnn-r50-nuscenes": ("maskrcnn-nuscenes", "nuscenes", True),
+    "ddq-detr-nuscenes": ("maskrcnn-nuscenes", "nuscenes", True),
+    "detectors-nuimages": ("maskrcnn-nuscenes", "nuscenes", True),
 }
+# gain of the class weights, with which scores differ, and a threshold that a handful of boxes passes
+_SCORES = {"kitti": (150.0, 0.75), "nuscenes": (2.6, 0.4)}
+IMAGE_SIZE = "400x225"
+"""Longer and shorter side of images that the camera networks see, in pixels."""
+
+DATA = {"kitti": ("kitti64", 2), "nuscenes": ("nuscenes32", 1)}
+"""Preset and number of the simulated frames by kind of dataset; of KITTI's, the last one is the validation split."""
 
 
 def filled_weights(names: Sequence[str], folder: Path) -> dict[str, str]:
@@ -30,54 +37,82 @@ def filled_weights(names: Sequence[str], folder: Path) -> dict[str, str]:
 
 
 def _filled(name: str, path: Path) -> str:
+    camera = _CAMERAS.get(name)
+    if camera is not None:
+        path = path.with_name(f"{camera[0]}.pth")
     if not path.is_file():
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(0)
             state = _state(name)
         with atomic_path(path) as temporary:
             torch.save({"state_dict": state}, temporary)
-    if name in _CAMERAS:
-        return f"fasterrcnn:{path}"
-    return str(path)
+    if camera is None:
+        return str(path)
+    return f"fasterrcnn:{path}?size={IMAGE_SIZE}&score_threshold={_SCORES[camera[1]][1]}"
 
 
 def _state(name: str) -> dict[str, Any]:
     """Parameters of an untrained network that finds something."""
+    if name in _CAMERAS:
+        return _camera_state(*_CAMERAS[name][1:])
     sensor = find_model(name).sensor
-    if sensor == "camera":
-        from lcf3d.detectors.camera.torchvision_fasterrcnn import FasterRCNNNetwork
-        from lcf3d.detectors.camera.torchvision_styles import STYLES
-
-        depth, style, masks = _CAMERAS[name]
-        state: dict[str, Any] = FasterRCNNNetwork(depth, STYLES[style], masks).state_dict()
-        for parameter, value in state.items():
-            # residual blocks that add nothing keep activations finite; large class weights make scores differ
-            if parameter.endswith("bn3.weight"):
-                value.zero_()
-            elif parameter.endswith("fc_cls.weight"):
-                value.mul_(150.0)
-        return state
     if sensor == "localizer":
         from lcf3d.localizers.pointnet2 import FrustumPointNet2
         from lcf3d.localizers.spec import LocalizerSpec
 
         data = "kitti" if "kitti" in name else "nuscenes"
-        state = FrustumPointNet2(LocalizerSpec.of("v2", data)).state_dict()
-        return state
-    from lcf3d.detectors.lidar.loading import detector_class
-    from lcf3d.detectors.lidar.presets import PRESETS
+        localizer: dict[str, Any] = FrustumPointNet2(LocalizerSpec.of("v2", data)).state_dict()
+        return localizer
+    if name.startswith("bevfusion"):
+        from lcf3d.detectors.fusion.bevfusion import BEVFusionNetwork
 
-    config = PRESETS[name]
-    network = detector_class(config.architecture).build(config)
+        network: Any = BEVFusionNetwork(cameras="lidar" not in name)
+        # its files have kernels over x, y, z
+        return {
+            key: value.permute(2, 1, 0, 3, 4).contiguous() if value.ndim == 5 else value
+            for key, value in _lively(network).state_dict().items()
+        }
+    if name.startswith("mvxnet"):
+        from lcf3d.detectors.fusion.mvxnet import MVXNetwork
+
+        network = MVXNetwork()
+    else:
+        from lcf3d.detectors.lidar.loading import detector_class
+        from lcf3d.detectors.lidar.presets import PRESETS
+
+        network = detector_class(PRESETS[name].architecture).build(PRESETS[name])
+    state: dict[str, Any] = _lively(network).state_dict()
+    return state
+
+
+def _camera_state(style: str, masks: bool) -> dict[str, Any]:
+    from lcf3d.detectors.camera.torchvision_fasterrcnn import FasterRCNNNetwork
+    from lcf3d.detectors.camera.torchvision_styles import STYLES
+
+    state: dict[str, Any] = FasterRCNNNetwork(50, STYLES[style], masks).state_dict()
+    for parameter, value in state.items():
+        # residual blocks that add nothing keep activations finite
+        if parameter.endswith("bn3.weight"):
+            value.zero_()
+        elif parameter.endswith("fc_cls.weight"):
+            value.mul_(_SCORES[style][0])
+    return state
+
+
+def _lively(network: Any) -> Any:
+    """A LiDAR network changed in place so that a few of its many anchors score."""
     for parameter, module in network.named_modules():
-        # gains that keep activations from fading, and few of the many anchors score, but some do
-        if isinstance(module, torch.nn.BatchNorm1d | torch.nn.BatchNorm2d) and module.weight is not None:
-            torch.nn.init.constant_(module.weight, 2.4)
+        if parameter.startswith("img_"):
+            if parameter.endswith("bn3"):
+                nn.init.zeros_(module.weight)
+            continue
+        # gains that keep activations from fading
+        if isinstance(module, nn.BatchNorm1d | nn.BatchNorm2d) and module.weight is not None:
+            nn.init.constant_(module.weight, 2.4)
         if parameter.endswith("conv_reg") and hasattr(module, "weight"):
             # boxes as large as their anchors
-            torch.nn.init.zeros_(module.weight)
-            torch.nn.init.zeros_(module.bias)
+            nn.init.zeros_(module.weight)
+            nn.init.zeros_(module.bias)
         if parameter.endswith(("conv_cls", "heatmap.1")) and getattr(module, "bias", None) is not None:
-            torch.nn.init.constant_(module.bias, -2.2)
-    state = network.state_dict()
-    return state
+            nn.init.constant_(module.bias, -2.2)
+    return network

@@ -63,7 +63,12 @@ def notes_of(rows: Sequence[Row], measured: Mapping[str, Measured]) -> tuple[str
             by_note.setdefault(note, []).append(row.name)
         if found and found.frames > 1:
             by_note.setdefault(f"measured on {found.frames} frames", []).append(row.name)
-    return tuple(f"{', '.join(names)}: {note}" for note, names in by_note.items())
+    every = [row.name for row in rows]
+    # of a single row there is nothing to tell apart
+    return tuple(
+        f"{'all rows' if names == every and len(every) > 1 else ', '.join(names)}: {note}"
+        for note, names in by_note.items()
+    )
 
 
 def markdown(data: TableData) -> str:

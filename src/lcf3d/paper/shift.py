@@ -8,12 +8,13 @@ from typing import Any
 from lcf3d.errors import ConfigError
 from lcf3d.evaluation.domain_report import COLUMNS, table_values
 from lcf3d.evaluation.domain_shift import IOU_THRESHOLDS
-from lcf3d.evaluation.domain_tasks import FUSED, LIDAR_ALONE, DomainTask, DomainTaskRunner
+from lcf3d.evaluation.domain_tasks import FRONT, FUSED, LIDAR_ALONE, DomainTask, DomainTaskRunner
 from lcf3d.files import read_json, write_json
 from lcf3d.fusion.config import FusionConfig
-from lcf3d.paper.networks import branches, substitutes
+from lcf3d.paper.kept import Kept
+from lcf3d.paper.networks import substitutes, with_setting
 from lcf3d.paper.tables import Row, Table
-from lcf3d.paper.workplace import Measured, Workplace, root_of, run_name
+from lcf3d.paper.workplace import Measured, Workplace, needed, root_of, run_name
 
 
 def measure_shift(table: Table, row: Row, place: Workplace) -> Measured:
@@ -24,11 +25,16 @@ def measure_shift(table: Table, row: Row, place: Workplace) -> Measured:
         ConfigError: what is kept was measured with other inputs.
         Lcf3dError: data, weights or result files are wrong.
     """
-    lidar, camera, _ = branches(row, place.uses, place.device)
+    lidar, camera, _ = needed(table, row, place)
     trained, tested = row.task or ("", "")
+    if lidar.startswith("mvxnet:") and tested != trained:
+        # the one camera that it looks through has another name there
+        lidar = with_setting(lidar, f"camera={FRONT[tested]}")
     root = root_of(tested, place)
     split = "val" if (root / "ImageSets" / "val.txt").is_file() else None
-    task = DomainTask(trained, tested, f"{tested}:{root}", lidar, camera or None, split=split)
+    # a network's scores are probabilities; those of files may be anything
+    calibration = "auto" if lidar.startswith("results:") else "none"
+    task = DomainTask(trained, tested, f"{tested}:{root}", lidar, camera or None, split=split, calibration=calibration)
     kept = place.out / "runs" / f"shift+{trained}+{tested}+{run_name(table, row)}.json"
     inputs = asdict(task)
     content: dict[str, Any] = {} if place.overwrite or not kept.is_file() else read_json(kept)
@@ -45,6 +51,11 @@ def measure_shift(table: Table, row: Row, place: Workplace) -> Measured:
 
 def _measure(task: DomainTask, row: Row, place: Workplace) -> dict[str, Any]:
     runner = DomainTaskRunner(task, FusionConfig.preset("paper"))
+    kept, folder = Kept(), place.out / "detections"
+    runner.lidar = kept.lidar(runner.lidar, folder, f"{task.lidar} of {task.trained}", task.dataset)
+    if runner.camera is not None and task.camera is not None:
+        # a run on nuScenes keeps those of the same network in ten classes
+        runner.camera = kept.camera(runner.camera, folder, f"{task.camera} in KITTI's classes", task.dataset)
     advance = place.begin(row.name, len(runner))
     found = runner(advance=advance)[FUSED if row.camera else LIDAR_ALONE]
     figures = dict(zip(COLUMNS, map(float, table_values(found)), strict=True))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib.resources import files
@@ -105,13 +106,34 @@ def find_row(table: Table, text: str) -> Row:
     Raises:
         ConfigError: none or several do.
     """
-    wanted = _plain(text)
-    exact = [row for row in table.rows if _plain(row.name) == wanted]
-    found = exact or [row for row in table.rows if wanted and _plain(row.name).startswith(wanted)]
+    found = _rows_of(table, text)
     if len(found) != 1:
         names = ", ".join(repr(row.name) for row in found or table.rows)
         raise ConfigError(f"{text!r} names {len(found)} rows of {table.name}, expected one; choose from {names}")
     return found[0]
+
+
+def find_rows(tables: Sequence[Table], texts: Sequence[str]) -> list[tuple[Table, tuple[Row, ...]]]:
+    """The named rows by table, see `find_row`; all rows without names. Tables that have none of them are left out.
+
+    Raises:
+        ConfigError: a name fits no table, or several rows of one.
+    """
+    if not texts:
+        return [(table, table.rows) for table in tables]
+    for text in texts:
+        if not any(_rows_of(table, text) for table in tables):
+            if len(tables) == 1:
+                find_row(tables[0], text)
+            raise ConfigError(f"no table has a row {text!r}; 'lcf3d paper all --dry' names all rows")
+    chosen = [(table, tuple(find_row(table, t) for t in texts if _rows_of(table, t))) for table in tables]
+    return [(table, rows) for table, rows in chosen if rows]
+
+
+def _rows_of(table: Table, text: str) -> list[Row]:
+    wanted = _plain(text)
+    exact = [row for row in table.rows if _plain(row.name) == wanted]
+    return exact or [row for row in table.rows if wanted and _plain(row.name).startswith(wanted)]
 
 
 def _plain(text: str) -> str:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from lcf3d.paper.estimates import DATA
-from lcf3d.paper.networks import NeedsError
+from lcf3d.paper.networks import NeedsError, branches
 from lcf3d.paper.tables import Row, Table
 
 # a LiDAR branch alone goes through the same run, which then changes nothing: no overlap is higher than 1
@@ -79,6 +79,27 @@ def run_name(table: Table, row: Row) -> str:
     return "+".join(parts).replace("/", "-")
 
 
+def needed(table: Table, row: Row, place: Workplace) -> tuple[str, str, str]:
+    """LiDAR, camera and localizer of a row, see `lcf3d.paper.networks.branches`, all of whose data is here too.
+
+    Raises:
+        NeedsError: data or weights are not here; all that is absent is named.
+    """
+    absent: list[str] = []
+    found = ("", "", "")
+    try:
+        found = branches(row, place.uses, place.device)
+    except NeedsError as error:
+        absent += error.parts
+    try:
+        root_of(row.task[1] if row.task else table.data[0], place)
+    except NeedsError as error:
+        absent += error.parts
+    if absent:
+        raise NeedsError(*absent)
+    return found
+
+
 def root_of(kind: str, place: Workplace) -> Path:
     """The folder of a dataset.
 
@@ -90,6 +111,6 @@ def root_of(kind: str, place: Workplace) -> Path:
     return place.roots[kind]
 
 
-def without_values(table: Table, note: str) -> Measured:
+def without_values(table: Table, *notes: str) -> Measured:
     """A row that could not be measured, and why."""
-    return Measured((None,) * len(table.columns), 0, (note,))
+    return Measured((None,) * len(table.columns), 0, notes)

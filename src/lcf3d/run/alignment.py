@@ -44,8 +44,7 @@ def find_alignment(
     Raises:
         DatasetError: no camera has detections in any of the frames looked at.
     """
-    most = FRAMES_WITH_IMAGES if any(isinstance(source, CameraOnImages) for source in cameras.values()) else FRAMES
-    chosen, step = _evenly(frame_ids, most)
+    chosen, step = _looked_at(frame_ids, cameras)
 
     def detections(frame: Frame) -> tuple[Detections3D, dict[str, Detections2D]] | None:
         names = [c.name for c in frame.cameras if c.name in cameras and cameras[c.name].sees(frame, c.name)]
@@ -57,6 +56,16 @@ def find_alignment(
             f"no frame has detections of {' or '.join(cameras)}: nothing to compare with the LiDAR boxes"
         )
     return {name: _reports(sightings) for name, sightings in seen.items()}
+
+
+def looked_at(frame_ids: Sequence[str], cameras: Mapping[str, CameraSource]) -> Sequence[str]:
+    """The frames that `find_alignment` looks at."""
+    return _looked_at(frame_ids, cameras)[0]
+
+
+def _looked_at(frame_ids: Sequence[str], cameras: Mapping[str, CameraSource]) -> tuple[Sequence[str], int]:
+    most = FRAMES_WITH_IMAGES if any(isinstance(source, CameraOnImages) for source in cameras.values()) else FRAMES
+    return _evenly(frame_ids, most)
 
 
 def turned_warnings(

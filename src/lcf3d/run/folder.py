@@ -9,19 +9,22 @@ OUT/...                  results in the dataset's own form: data/ID.txt for KITT
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from lcf3d.datasets.base import ResultWriter
 from lcf3d.errors import ConfigError
 from lcf3d.files import atomic_path, inside, list_files, read_json, read_text, reading, remove_left_overs, write_json
 from lcf3d.frame import Frame
-from lcf3d.fusion.config import FusionConfig
 from lcf3d.processes import lock_folder, unlock_folder
 from lcf3d.provenance import FusedDetections
 from lcf3d.remote.places import remove
+
+if TYPE_CHECKING:
+    from lcf3d.fusion.config import FusionConfig
 
 FORMAT = 2
 """Of run folders; those of version 1 (lcf3d 0.1) are read, but not resumed."""
@@ -84,21 +87,44 @@ class RunFolder:
                 other settings or inputs.
         """
         run = {"format": FORMAT, **run}
+        if self.path.is_file():
+            raise ConfigError(f"{self.path} is a file; choose a folder for --out")
         self.lock()
         try:
+            self.require_place(_form(run), resume=resume, overwrite=overwrite)
             self._begin(config, run, resume=resume, overwrite=overwrite)
         except BaseException:
             self.release()
             raise
 
+    def require_place(self, form: str, *, resume: bool, overwrite: bool) -> None:
+        """See that a run may begin here, as far as that can be told before its inputs are read.
+
+        Raises:
+            ConfigError: the folder is a file, cannot be written, holds something and neither ``resume`` nor
+                ``overwrite`` is set, or something that is no run of this form.
+        """
+        if self.path.is_file():
+            raise ConfigError(f"{self.path} is a file; choose a folder for --out")
+        there = next(path for path in (self.path, *self.path.absolute().parents) if path.exists())
+        if not there.is_dir() or not os.access(there, os.W_OK | os.X_OK):
+            raise ConfigError(f"{self.path} cannot be written: {there} is read-only or no folder; choose another --out")
+        if not list_files(self.path):
+            return
+        if not resume and not overwrite:
+            raise ConfigError(f"{self.path} is not empty; pass --resume, --overwrite or another --out")
+        inputs = self.path / "run.json"
+        if overwrite and not inputs.is_file():
+            raise ConfigError(f"{self.path} holds files of something else; choose another --out")
+        if overwrite and _form(read_json(inputs)) != form:
+            raise ConfigError(f"{self.path} holds a run of another --format; choose another --out")
+
     def lock(self) -> None:
         """Keep other processes from writing into the folder until `release`, or until this process ends.
 
         Raises:
-            ConfigError: another process is writing; says which. Or the folder is a file.
+            ConfigError: another process is writing; says which.
         """
-        if self.path.is_file():
-            raise ConfigError(f"{self.path} is a file; choose a folder for --out")
         lock_folder(self.path)
 
     def release(self) -> None:
@@ -111,8 +137,6 @@ class RunFolder:
         settings, inputs = self.path / "config.yaml", self.path / "run.json"
         occupied = bool(list_files(self.path))
         if occupied and not overwrite:
-            if not resume:
-                raise ConfigError(f"{self.path} is not empty; pass --resume, --overwrite or another --out")
             # a run that was killed before it had written its settings
             same = not settings.is_file() or read_text(settings) == config.to_yaml()
             if not same or not inputs.is_file() or read_json(inputs) != run:
@@ -121,10 +145,6 @@ class RunFolder:
                     "pass --overwrite or another --out"
                 )
         elif occupied:
-            if not inputs.is_file():
-                raise ConfigError(f"{self.path} holds files of something else; choose another --out")
-            if _form(read_json(inputs)) != _form(run):
-                raise ConfigError(f"{self.path} holds a run of another --format; choose another --out")
             for file in self._own_files():
                 remove(file)
         write_json(inputs, run)

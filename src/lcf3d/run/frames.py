@@ -11,6 +11,8 @@ from multiprocessing import get_all_start_methods, get_context, get_start_method
 from time import perf_counter
 from typing import Any, Protocol
 
+import numpy as np
+
 from lcf3d.datasets.base import CameraSource, Dataset, LidarSource
 from lcf3d.errors import ConfigError, DatasetError
 from lcf3d.frame import Frame
@@ -168,11 +170,15 @@ class FrameRunner:
 def summarize(frame_id: str, fused: FusedDetections, milliseconds: dict[str, float]) -> FrameSummary:
     """Count what the fusion of one frame decided."""
     names = fused.detections.class_names
+    outputs: Counter[tuple[str, str]] = Counter()
+    dropped: Counter[str] = Counter()
     # counted as numbers, named after it
-    codes = Counter(zip(fused.outcomes.tolist(), fused.detections.labels.tolist(), strict=True))
-    outputs = Counter({(OUTCOMES[outcome], names[label]): n for (outcome, label), n in codes.items()})
-    reasons = Counter(fused.lidar.reason[fused.dropped_lidar].tolist())
-    dropped = Counter({REASONS[reason]: n for reason, n in reasons.items()})
+    codes = np.bincount(fused.outcomes * len(names) + fused.detections.labels)
+    for code in codes.nonzero()[0].tolist():
+        outputs[OUTCOMES[code // len(names)], names[code % len(names)]] = int(codes[code])
+    reasons = np.bincount(fused.lidar.reason[fused.dropped_lidar])
+    for reason in reasons.nonzero()[0].tolist():
+        dropped[REASONS[reason]] = int(reasons[reason])
     return FrameSummary(frame_id, outputs, dropped, milliseconds=milliseconds)
 
 

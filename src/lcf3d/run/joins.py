@@ -25,24 +25,6 @@ def left_out_notes(lidar: LidarSource, cameras: Mapping[str, CameraSource]) -> t
     )
 
 
-def reported_classes(
-    cameras: Mapping[str, CameraSource], config: FusionConfig, frames: int
-) -> dict[str, Collection[str]]:
-    """The classes that each camera's detector can report at all, where that is known.
-
-    A detector says so (``reports``); of result files it is what they hold, if they are of enough frames to tell.
-    """
-    found: dict[str, Collection[str]] = {}
-    for name, source in cameras.items():
-        reports = getattr(source, "reports", None)
-        left_out = getattr(source, "left_out", None)
-        if reports is None and isinstance(left_out, LeftOut) and left_out.seen and frames >= FEW_FRAMES:
-            reports = left_out.seen
-        if reports is not None:
-            found[name] = tuple(c for c in config.class_names if c in set(reports))
-    return found
-
-
 def report_notes(reports: Mapping[str, Collection[str]], config: FusionConfig) -> tuple[str, ...]:
     """Which classes no detector of which cameras reports."""
     by_missing: dict[tuple[str, ...], list[str]] = {}

@@ -12,6 +12,7 @@ import platform
 from collections import Counter, deque
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -72,8 +73,9 @@ class Plan:
         """
         inputs = read_inputs(self.request, settings=self.config, look=False)
         for name, source in {"": inputs.lidar, **inputs.cameras}.items():
-            if self.left_out.get(name) is not None:
-                setattr(source, "left_out", self.left_out[name])  # noqa: B010 - not every source counts
+            # not every source counts, and some add up what others have counted
+            if self.left_out.get(name) is not None and "left_out" in vars(source):
+                setattr(source, "left_out", self.left_out[name])  # noqa: B010
         tables = self.request.form == "parquet"
         folder = TableRunFolder(out) if tables else RunFolder(out, inputs.dataset.writer(out))
         fusion = make_fusion(self.config, inputs.localizer, self.calibration, self.reports)
@@ -98,6 +100,10 @@ class ShardWorker:
         try:
             if self._runner is None:
                 self._runner = self._plan.runner(Path(self._folder.name))
+            for source in (self._runner.lidar, *self._runner.cameras.values()):
+                # all files of the shard at once
+                if getattr(source, "reads_frames", False):
+                    source.load(frame_ids)  # type: ignore[attr-defined]
             summaries = list(run_shard(self._runner, frame_ids))
             return summaries, _taken(Path(self._folder.name))
         except Lcf3dError as error:
@@ -131,13 +137,29 @@ def fuse_frames(
         sequences: groups of frames that must not be taken apart, see `run_frames`.
 
     Raises:
-        ConfigError: both ``jobs`` and ``ray``.
+        Lcf3dError: see `require_processes`.
     """
+    require_processes(run.request, jobs, ray)
     if ray is None:
         return run_frames(run.runner, frame_ids, jobs, sequences)
+    return run_on_ray(run, frame_ids, ray)
+
+
+def require_processes(request: RunRequest, jobs: int, ray: str | None) -> None:
+    """Refuse a cluster that a run cannot use, before anything is read.
+
+    Raises:
+        ConfigError: ``jobs`` beside ``ray``, or a run that remembers earlier frames.
+        MissingExtraError: Ray is not installed.
+    """
+    if ray is None:
+        return
     if jobs > 1:
         raise ConfigError("--ray has a worker for each processor or GPU of its cluster; leave --jobs out")
-    return run_on_ray(run, frame_ids, ray)
+    if request.memory or request.smooth:
+        raise ConfigError("--ray takes drives apart, and --memory and --smooth need them whole; leave one out")
+    if find_spec("ray") is None:
+        raise MissingExtraError("ray", "fleet", "--ray")
 
 
 def run_on_ray(run: Run, frame_ids: Sequence[str], address: str) -> Iterator[FrameSummary]:
@@ -149,12 +171,10 @@ def run_on_ray(run: Run, frame_ids: Sequence[str], address: str) -> Iterator[Fra
         address: of the cluster; ``auto`` for the one of this machine, started for the time being if there is none.
 
     Raises:
-        ConfigError: the cluster cannot be used, or the run remembers earlier frames.
+        ConfigError: the cluster cannot be used.
         MissingExtraError: Ray is not installed.
         Lcf3dError: an input is at fault, or a shard cost `ATTEMPTS` workers.
     """
-    if run.runner.memory is not None:
-        raise ConfigError("--ray takes drives apart, and --memory and --smooth need them whole; leave one out")
     shards = shards_of(run.folder, frame_ids, 16)
     if not shards:
         return

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from typing import TYPE_CHECKING
 
 from lcf3d.datasets.base import Dataset
 from lcf3d.errors import DatasetError
 from lcf3d.frame import Frame
+
+if TYPE_CHECKING:
+    from lcf3d.run.setup import Run
 
 
 def in_order(dataset: Dataset, frame_ids: Sequence[str]) -> list[list[str]]:
@@ -43,6 +47,14 @@ def places_in_order(frames: Iterable[Frame], told: bool = True) -> list[list[int
     for sequence, members in groups.items():
         result[placed[sequence]] = [place for _, place in sorted(members)]
     return result
+
+
+def pending_frames(run: Run) -> tuple[list[str], list[Sequence[str]] | None]:
+    """The frames of a run that are still to be done; and, where it remembers earlier ones, in whole sequences."""
+    if run.runner.memory is None:
+        return [frame_id for frame_id in run.frame_ids if not run.folder.is_done(frame_id)], None
+    sequences = pending(in_order(run.dataset, run.frame_ids), run.folder.is_done)
+    return [frame_id for sequence in sequences for frame_id in sequence], sequences
 
 
 def pending(sequences: Sequence[Sequence[str]], is_done: Callable[[str], bool]) -> list[Sequence[str]]:

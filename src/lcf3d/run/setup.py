@@ -12,29 +12,25 @@ from lcf3d.datasets.base import CameraSource, Dataset, LidarSource, by_camera, r
 from lcf3d.datasets.opening import open_dataset
 from lcf3d.errors import ConfigError, DatasetError
 from lcf3d.files import write_json
-from lcf3d.fusion.alignment import Alignment
+from lcf3d.formats.fused_table import arrow
 from lcf3d.fusion.calibration import Calibration, load_calibration, memory_settings
 from lcf3d.fusion.config import FusionConfig
 from lcf3d.fusion.localizer import Localizer
 from lcf3d.fusion.pipeline import LateCascadeFusion
-from lcf3d.fusion.self_calibration import self_calibrate
 from lcf3d.fusion.stereo import StereoConfig, StereoLateCascadeFusion
 from lcf3d.localizers.named import load_localizer
-from lcf3d.run.alignment import aligned_frame, describe, find_alignment, turned_warnings
+from lcf3d.processes import LOCK
+from lcf3d.run.alignment import describe, find_alignment, looked_at, turned_warnings
 from lcf3d.run.folder import RunFolder
 from lcf3d.run.frames import FrameRunner
-from lcf3d.run.joins import FEW_FRAMES, left_out_counts, left_out_notes, report_notes, reported_classes, score_notes
+from lcf3d.run.joins import left_out_counts, left_out_notes, report_notes, score_notes
 from lcf3d.run.settings import build_config
-from lcf3d.run.shards import frames_of_shard
-from lcf3d.run.sources import CameraOnImages, DetectorOnFrames, LidarOnScans, open_cameras, open_lidar
+from lcf3d.run.shards import frames_of_shard, parse_shard
+from lcf3d.run.sources import CameraOnImages, open_cameras, open_lidar
 from lcf3d.run.table_folder import TableRunFolder, require_form
+from lcf3d.run.teaching import Looked, find_calibration, look_in_files, reported_classes, teaching_frames
 
 log = logging.getLogger(__name__)
-
-# frames that a calibration without labels looks at, evenly over the run
-TEACHING_FRAMES = 400
-# the same where a camera detector has to be run on them
-TEACHING_IMAGES = 40
 
 
 @dataclass(frozen=True)
@@ -143,13 +139,13 @@ def prepare_run(
     Raises:
         Lcf3dError: anything wrong with the request, the dataset or the result files.
     """
-    require_form(request.form)
-    # a shard reads and calibrates like the whole run, so that its results are those of the whole
+    _require_possible(request)
+    if not (out / LOCK).exists():
+        # else somebody writes there, which `begin` says
+        RunFolder(out).require_place(request.form, resume=resume, overwrite=overwrite)
     inputs = read_inputs(request, settings=settings)
     dataset, frame_ids, config, lidar, cameras, localizer = inputs
     own_ids = frames_of_shard(frame_ids, request.shard)
-    if request.shard is not None and (request.memory or request.smooth):
-        raise ConfigError("--shard takes drives apart, and --memory and --smooth need them whole; leave one out")
     folder = TableRunFolder(out) if request.form == "parquet" else RunFolder(out, dataset.writer(out))
     fusion = make_fusion(config, localizer)
     runner = FrameRunner(dataset, lidar, cameras, fusion, folder, smooth=request.smooth)
@@ -158,13 +154,14 @@ def prepare_run(
     # checked before anything is written; with results in files this is quick
     reports = find_alignment(dataset, frame_ids, lidar, cameras, config.class_names) if request.self_calibrate else {}
     runner.alignment = {name: whole.alignment for name, (whole, *_) in reports.items()}
+    looked = look_in_files(dataset, frame_ids, cameras)
     if resume and folder.calibration_path.is_file():
         calibration: Calibration | None = Calibration.load(folder.calibration_path)
     else:
         calibration = find_calibration(
-            request.calibration, dataset, frame_ids, lidar, cameras, config, runner.alignment
+            request.calibration, dataset, frame_ids, lidar, cameras, config, runner.alignment, looked
         )
-    runner.fusion, notes = calibrated_fusion(inputs, calibration)
+    runner.fusion, notes = calibrated_fusion(inputs, calibration, looked)
     written: dict[str, Any] = {
         "lcf3d": __version__,
         **asdict(request),
@@ -181,6 +178,23 @@ def prepare_run(
     if request.memory or request.smooth:
         runner.memory = memory_settings(calibration)
     return Run(dataset, own_ids, config, runner, folder, request, notes)
+
+
+def _require_possible(request: RunRequest) -> None:
+    """Refuse, before anything is read, what cannot be run.
+
+    Raises:
+        Lcf3dError: says what.
+    """
+    require_form(request.form)
+    if request.form == "parquet":
+        arrow()
+    if request.shard is not None:
+        parse_shard(request.shard)
+        if request.memory or request.smooth:
+            raise ConfigError("--shard takes drives apart, and --memory and --smooth need them whole; leave one out")
+    if request.calibration != "auto":
+        load_calibration(request.calibration)
 
 
 def read_inputs(
@@ -218,12 +232,29 @@ def read_inputs(
         dataset.require_complete(frame_ids)
     lidar = open_lidar(request.lidar, dataset, config.class_names, request.missing)
     cameras = by_camera(dataset, open_cameras(texts, dataset, config.class_names, request.missing, request.tiles))
+    loaded = load_localizer(request.localizer)
     if look:
-        for source in (lidar, *cameras.values()):
-            if hasattr(source, "load"):
-                source.load(frame_ids)
+        _load((lidar, *cameras.values()), frame_ids, request, cameras)
         _require_images(dataset, frame_ids, cameras)
-    return Inputs(dataset, frame_ids, config, lidar, cameras, load_localizer(request.localizer))
+    return Inputs(dataset, frame_ids, config, lidar, cameras, loaded)
+
+
+def _load(
+    sources: Sequence[object], frame_ids: Sequence[str], request: RunRequest, cameras: Mapping[str, CameraSource]
+) -> None:
+    """Read result files: those of all frames, or of a shard its own and those that the whole run learns from."""
+    parts: list[Sequence[str]] = [frame_ids]
+    if request.shard is not None:
+        learned = set(teaching_frames(frame_ids))
+        if request.self_calibrate:
+            learned.update(looked_at(frame_ids, cameras))
+        # last its own, which are counted
+        parts = [[one for one in frame_ids if one in learned], frames_of_shard(frame_ids, request.shard)]
+    for source in sources:
+        if hasattr(source, "load"):
+            for part in parts if getattr(source, "reads_frames", False) else [frame_ids]:
+                if part:
+                    source.load(part)
 
 
 def camera_texts(cameras: dict[str, str], dataset: Dataset) -> dict[str, str]:
@@ -284,8 +315,15 @@ def make_fusion(
     return LateCascadeFusion(config, localizer, calibration=calibration, reports=reports)
 
 
-def calibrated_fusion(inputs: Inputs, calibration: Calibration | None) -> tuple[LateCascadeFusion, tuple[str, ...]]:
+def calibrated_fusion(
+    inputs: Inputs, calibration: Calibration | None, looked: Looked | None = None
+) -> tuple[LateCascadeFusion, tuple[str, ...]]:
     """The fusion that runs, and what is to be said once: what is left out, and which classes no camera is asked about.
+
+    Args:
+        inputs: of the run.
+        calibration: of the scores.
+        looked: what `look_in_files` gave for them, where that is known.
 
     Raises:
         ConfigError: scores that are no probabilities and have no score map.
@@ -294,77 +332,12 @@ def calibrated_fusion(inputs: Inputs, calibration: Calibration | None) -> tuple[
         require = getattr(source, "require_probabilities", None)
         if require is not None:
             require(getattr(calibration, maps) if calibration else ())
-    reported = reported_classes(inputs.cameras, inputs.config, len(inputs.frame_ids))
+    if looked is None:
+        looked = look_in_files(inputs.dataset, inputs.frame_ids, inputs.cameras)
+    reported = reported_classes(inputs.cameras, inputs.config, len(inputs.frame_ids), looked)
     notes = (
         *left_out_notes(inputs.lidar, inputs.cameras),
         *report_notes(reported, inputs.config),
         *score_notes(inputs.config),
     )
     return make_fusion(inputs.config, inputs.localizer, calibration, reported), notes
-
-
-def find_calibration(
-    wanted: str,
-    dataset: Dataset,
-    frame_ids: Sequence[str],
-    lidar: LidarSource,
-    cameras: dict[str, CameraSource],
-    config: FusionConfig,
-    alignment: Mapping[str, Alignment] | None = None,
-) -> Calibration | None:
-    """The calibration of the file asked for, or one taught by the camera, where that is needed or costs nothing.
-
-    Args:
-        wanted: a file, ``none``, or ``auto``.
-        dataset: whose frames they are.
-        frame_ids: the frames of the run.
-        lidar: the LiDAR branch.
-        cameras: the camera branch by camera name.
-        config: settings.
-        alignment: how cameras stand beside what their calibration says, by name.
-
-    Raises:
-        ConfigError: there is no such file.
-    """
-    if wanted != "auto":
-        return load_calibration(wanted)
-    if isinstance(lidar, (LidarOnScans, DetectorOnFrames)):
-        return None
-    low, high = _score_range(dataset, frame_ids, lidar)
-    probabilities = low >= 0 and high <= 1
-    in_files = all(not isinstance(source, CameraOnImages) for source in cameras.values())
-    # probabilities need no map, but evidence also asks which classes the camera knows, which files tell at no cost
-    if probabilities and not (config.ensemble == "evidence" and in_files and len(frame_ids) >= FEW_FRAMES):
-        return None
-    chosen = frame_ids[:: -(-len(frame_ids) // (TEACHING_FRAMES if in_files else TEACHING_IMAGES))]
-    if not probabilities:
-        log.warning(
-            "LiDAR scores go from %.4g to %.4g and are no probabilities: calibrated without labels on %d frames, with "
-            "the camera as teacher; 'lcf3d calibrate' on labelled frames does better",
-            low,
-            high,
-            len(chosen),
-        )
-    teaching = []
-    for frame in map(dataset.frame, chosen):
-        seen = [c.name for c in frame.cameras if c.name in cameras and cameras[c.name].sees(frame, c.name)]
-        if seen:
-            fused = aligned_frame(frame, alignment or {})
-            teaching.append((fused, lidar.detect(frame), {name: cameras[name].detect(frame, name) for name in seen}))
-    calibration = self_calibrate(teaching, config)
-    if len(chosen) < FEW_FRAMES:
-        calibration = calibration.model_copy(update={"camera_classes": None})
-    return calibration
-
-
-def _score_range(dataset: Dataset, frame_ids: Sequence[str], lidar: LidarSource) -> tuple[float, float]:
-    """Lowest and highest score of the LiDAR branch over all frames, 0 and 0 without any."""
-    if hasattr(lidar, "score_range"):
-        known: tuple[float, float] = lidar.score_range(frame_ids)
-        return known
-    low, high = 0.0, 0.0
-    for frame_id in frame_ids:
-        scores = lidar.detect(dataset.frame(frame_id)).scores
-        if len(scores):
-            low, high = min(low, float(scores.min())), max(high, float(scores.max()))
-    return low, high

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,8 @@ from lcf3d.files import copy_file, list_files, write_json
 from lcf3d.run.folder import RunFolder
 from lcf3d.run.table_folder import open_run_folder
 
+# entries of run.json that belong to a shard
+_OWN = ("shard", "lcf3d", "left_out", "notes")
 _FOLDERS = ("provenance", "detections", "data")
 
 
@@ -50,9 +53,12 @@ def merge_shards(shards: Sequence[Path], out: Path) -> int:
     """
     if out.exists() and (not out.is_dir() or list_files(out)):
         raise ConfigError(f"{out} is not empty; choose another --out")
+    for folder in shards:
+        if not RunFolder.is_run(folder):
+            raise ConfigError(f"{folder} is no folder of 'lcf3d run': it has no run.json and provenance")
     requests = {folder: RunFolder(folder).request() for folder in shards}
     _require_whole(requests)
-    request = {**next(iter(requests.values())), "shard": None}
+    request = {**next(iter(requests.values())), "shard": None, **_counts(list(requests.values()))}
     try:
         dataset = open_dataset(request["dataset"], split=request["split"], version=request.get("tables"))
     except DatasetError as error:
@@ -79,6 +85,22 @@ def merge_shards(shards: Sequence[Path], out: Path) -> int:
     return len(frame_ids)
 
 
+def _counts(requests: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """What all shards together leave out, and their notes: those of all, then what each says besides."""
+    known = [request.get("left_out", {}) for request in requests]
+    if all(counts == known[0] for counts in known):
+        return {"left_out": known[0], "notes": requests[0].get("notes", [])}
+    left_out: dict[str, dict[str, Counter[str]]] = {}
+    for counts in known:
+        for branch, kinds in counts.items():
+            for kind, names in kinds.items():
+                left_out.setdefault(branch, {}).setdefault(kind, Counter()).update(names)
+    notes = [f"shard {request['shard']}: {note}" for request in requests for note in request.get("notes", [])]
+    shared = set.intersection(*(set(request.get("notes", [])) for request in requests))
+    first = [note for note in requests[0].get("notes", []) if note in shared]
+    return {"left_out": left_out, "notes": first + [n for n in notes if n.partition(": ")[2] not in shared]}
+
+
 def _require_whole(requests: dict[Path, dict[str, Any]]) -> None:
     """See that these are all parts of one run."""
     holders: dict[str, Path] = {}
@@ -93,7 +115,7 @@ def _require_whole(requests: dict[Path, dict[str, Any]]) -> None:
             raise ConfigError(f"shard {shard} is there twice, in {holders[shard]} and {folder}: leave one out")
         holders[shard] = folder
         counts.add(parse_shard(shard)[1])
-        different = [key for key in request if key not in ("shard", "lcf3d") and request[key] != first[1].get(key)]
+        different = [key for key in request if key not in _OWN and request[key] != first[1].get(key)]
         if different:
             raise ConfigError(f"{first[0]} and {folder} are shards of different runs: they differ in {different[0]}")
         if (folder / "config.yaml").read_text("utf-8") != (first[0] / "config.yaml").read_text("utf-8"):

@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from lcf3d.simulation.meshes import street as build
+from lcf3d.simulation.meshes import buildings
 from lcf3d.simulation.meshes.primitives import Mesh, box, ellipsoid, tube
 from lcf3d.simulation.roadside import WALLS, any_of
 
@@ -110,7 +110,7 @@ def _wall(rng: np.random.Generator) -> Mesh:
     if rng.random() < 0.35:
         size = (float(rng.uniform(0.3, 0.6)), float(rng.uniform(0.3, 0.6)), float(rng.uniform(1.2, 2.6)))
         return box((0, 0, size[2] / 2), size, "brick" if rng.random() < 0.4 else "concrete", _any(WALLS, rng))
-    return build.garden_wall(float(rng.uniform(1.5, 7.0)), float(rng.uniform(0.8, 3.0)), bool(rng.random() < 0.4))
+    return buildings.garden_wall(float(rng.uniform(1.5, 7.0)), float(rng.uniform(0.8, 3.0)), bool(rng.random() < 0.4))
 
 
 def _rack(rng: np.random.Generator) -> Mesh:

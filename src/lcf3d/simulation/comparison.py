@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -22,6 +22,9 @@ RANGE_EDGES: Final = np.array([0, 3, 4, 5, 6, 8, 10, 12.5, 15, 20, 25, 30, 40, 5
 DISTANCE_EDGES: Final = np.array([5, 10, 15, 20, 25, 30, 40, 50, 60.0])
 """Edges of the distance classes for points per object, in metres."""
 INTENSITY_EDGES: Final = np.linspace(0, 1, 21)
+HEIGHT_EDGES: Final = np.array([0, 25, 50, 100, 375.0])
+"""Edges of the classes of heights in the image, in pixels."""
+DRAWN_CLASSES: Final = ("Car", "Pedestrian", "Cyclist")
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +57,7 @@ class LabelStatistics:
         distances: class -> (K,) metres from the camera.
         sizes: class -> (K, 3) length, width, height.
         occlusion: class -> (4,) share of occlusion levels 0 to 3.
+        heights: class -> (K,) pixels from top to bottom of the 2D boxes.
     """
 
     frames: int
@@ -62,6 +66,7 @@ class LabelStatistics:
     distances: dict[str, FloatArray]
     sizes: dict[str, FloatArray]
     occlusion: dict[str, FloatArray]
+    heights: dict[str, FloatArray]
 
 
 def scan_statistics(
@@ -144,6 +149,7 @@ def label_statistics(root: Path, ids: Sequence[str] | None = None) -> LabelStati
         {n: np.linalg.norm(every.locations[mask[n]][:, [0, 2]], axis=1) for n in solid},
         {n: every.dimensions[mask[n]][:, [2, 1, 0]] for n in solid},
         {n: np.bincount(every.occluded[mask[n]].clip(0, 3), minlength=4) / max(1, mask[n].sum()) for n in solid},
+        {n: every.boxes2d[mask[n]][:, 3] - every.boxes2d[mask[n]][:, 1] for n in solid},
     )
 
 
@@ -154,6 +160,11 @@ def median_points(objects: FloatArray) -> FloatArray:
         np.median(objects[which == k, 1]) if (which == k).sum() >= 2 else np.nan for k in range(len(DISTANCE_EDGES) - 1)
     ]
     return np.array(result)
+
+
+def height_shares(labels: LabelStatistics) -> dict[str, FloatArray]:
+    """Class -> (len(HEIGHT_EDGES) - 1,) share of its labels in each class of height in the image."""
+    return {n: np.histogram(h, HEIGHT_EDGES)[0] / max(1, len(h)) for n, h in labels.heights.items()}
 
 
 def summary(
@@ -184,6 +195,7 @@ def summary(
             "frames_with": s.frames_with,
             "distance_10_50_90": quartiles,
             "occlusion": {n: o.round(3).tolist() for n, o in s.occlusion.items()},
+            "heights_px": {n: shares.round(3).tolist() for n, shares in height_shares(s).items()},
         }
 
     inside = np.abs(simulated.ranges.mean(axis=0) - real.ranges.mean(axis=0)) <= 2 * real.ranges.std(axis=0)
@@ -206,7 +218,7 @@ def draw(
     simulated_labels: LabelStatistics,
     path: Path,
 ) -> None:
-    """Draw the comparison as a PNG with six panels.
+    """Draw the comparison as a PNG with eight panels.
 
     Raises:
         MissingExtraError: matplotlib is not installed.
@@ -215,8 +227,8 @@ def draw(
         from matplotlib.figure import Figure
     except ImportError:
         raise MissingExtraError("matplotlib", "simulate", "drawing the comparison") from None
-    figure = Figure(figsize=(13, 7.5), dpi=90, layout="constrained")
-    axes = figure.subplots(2, 3)
+    figure = Figure(figsize=(16.5, 7.5), dpi=90, layout="constrained")
+    axes = figure.subplots(2, 4)
     _draw_scans(axes, ((real, *REAL_LOOK), (simulated, *SIMULATED_LOOK)))
     _draw_labels(axes, ((-0.2, real_labels, *REAL_LOOK), (0.2, simulated_labels, *SIMULATED_LOOK)))
     for axis in axes.flat:
@@ -240,7 +252,7 @@ def _draw_scans(axes: Any, both: Sequence[tuple[ScanStatistics, str, str]]) -> N
         axes[0, 1].errorbar(centre, *ranges, color=colour, capsize=3, label=name, **dots)
         intensities = s.intensities.mean(axis=0), s.intensities.std(axis=0)
         axes[0, 2].errorbar(middle, *intensities, color=colour, capsize=2, **dots)
-        for kind, style in (("Car", "-"), ("Pedestrian", "--"), ("Cyclist", ":")):
+        for kind, style in zip(DRAWN_CLASSES, ("-", "--", ":"), strict=True):
             distances, medians = (DISTANCE_EDGES[1:] + DISTANCE_EDGES[:-1]) / 2, median_points(s.objects[kind])
             axes[1, 0].plot(distances, medians, style, color=colour, label=f"{kind}, {name}", **dots)
             axes[1, 0].scatter(s.objects[kind][:, 0], s.objects[kind][:, 1], s=3, color=colour, alpha=0.25)
@@ -252,7 +264,7 @@ def _draw_scans(axes: Any, both: Sequence[tuple[ScanStatistics, str, str]]) -> N
 
 
 def _draw_labels(axes: Any, sides: Sequence[tuple[float, LabelStatistics, str, str]]) -> None:
-    """Labels a frame and their distances, of labels with the place of their bars, name and colour."""
+    """Labels a frame, their distances, occlusion and heights, of labels with the place of their bars, name, colour."""
     names = ("Car", "Van", "Truck", "Pedestrian", "Cyclist", "DontCare")
     none = np.zeros(0)
     for shift, t, name, colour in sides:
@@ -263,9 +275,22 @@ def _draw_labels(axes: Any, sides: Sequence[tuple[float, LabelStatistics, str, s
         axes[1, 2].hist(cars, edges, density=True, alpha=0.55, color=colour, label=f"Car, {name}")
         label = f"Pedestrian, Cyclist, {name}"
         axes[1, 2].hist(np.concatenate(people), edges, density=True, histtype="step", lw=1.6, color=colour, label=label)
+        _draw_shares(axes[0, 3], shift, t.occlusion, name, colour)
+        _draw_shares(axes[1, 3], shift, height_shares(t), name, colour)
     axes[1, 1].set(title="labels per frame", xticks=np.arange(len(names)))
     axes[1, 1].set_xticklabels(names, fontsize=8)
     axes[1, 2].set(title="distance of labels (m)")
+    axes[0, 3].set(title="labels of occlusion 0, 1, 2, 3 (share)")
+    lowest = ", ".join(f"{edge:g}" for edge in HEIGHT_EDGES[:-1])
+    axes[1, 3].set(title=f"labels of {lowest} and more pixels (share)")
+
+
+def _draw_shares(axis: Any, shift: float, shares: Mapping[str, FloatArray], name: str, colour: str) -> None:
+    """Four bars a class, the classes side by side."""
+    places = np.array([[5 * k + level for level in range(4)] for k in range(len(DRAWN_CLASSES))])
+    heights = [shares.get(n, np.zeros(4)) for n in DRAWN_CLASSES]
+    axis.bar(places.ravel() + shift, np.concatenate(heights), 0.4, color=colour, label=name)
+    axis.set_xticks(places.mean(axis=1), DRAWN_CLASSES, fontsize=8)
 
 
 def compare(

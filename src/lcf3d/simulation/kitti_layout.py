@@ -85,16 +85,20 @@ def calibration_text(preset: Preset) -> str:
 
 
 def write_splits(root: Path, ids: Sequence[str], frames_per_drive: int) -> None:
-    """Write ``ImageSets/train.txt`` and ``val.txt``; no drive is divided unless it is the only one.
-
-    Where there are fewer than `VAL_EVERY` drives, the last of several is ``val``.
-    """
-    groups = [ids[k : k + frames_per_drive] for k in range(0, len(ids), frames_per_drive)]
+    """Write ``ImageSets/train.txt`` and ``val.txt``; no drive is divided unless it is the only one."""
+    groups = [list(ids[k : k + frames_per_drive]) for k in range(0, len(ids), frames_per_drive)]
     if len(groups) == 1:
         groups = [[id] for id in ids]
-    every = min(VAL_EVERY, max(2, len(groups)))
-    val = [id for k, group in enumerate(groups) if k % every == every - 1 for id in group]
-    chosen = set(val)
-    train = [id for id in ids if id not in chosen]
-    for name, members in (("train", train), ("val", val)):
+    for name, members in zip(("train", "val"), split_groups(groups), strict=True):
         write_text(root / "ImageSets" / f"{name}.txt", "".join(f"{id}\n" for id in members))
+
+
+def split_groups(groups: Sequence[list[str]]) -> tuple[list[str], list[str]]:
+    """Members of ``train`` and of ``val``: every `VAL_EVERY`-th group is ``val``; of two to four the last.
+
+    A single group is both: a list without members is of no use to anybody.
+    """
+    every = min(VAL_EVERY, max(1, len(groups)))
+    val = [k for k in range(len(groups)) if k % every == every - 1]
+    train = [k for k in range(len(groups)) if k not in val] or val
+    return [id for k in train for id in groups[k]], [id for k in val for id in groups[k]]

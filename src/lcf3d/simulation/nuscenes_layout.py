@@ -13,7 +13,7 @@ from lcf3d.files import atomic_path, read_json, write_json, write_text
 from lcf3d.geometry.rotation import quaternions_from_matrices, quaternions_from_yaws
 from lcf3d.simulation.actors import NUSCENES_CLASS
 from lcf3d.simulation.frames import SimulatedFrame, attribute, capture, sensor_pose
-from lcf3d.simulation.kitti_layout import VAL_EVERY, write_bytes, write_png
+from lcf3d.simulation.kitti_layout import split_groups, write_bytes, write_png
 from lcf3d.simulation.presets import (
     NUSCENES_CAMERAS,
     ego_from_nuscenes_camera,
@@ -171,10 +171,8 @@ def write_tables(root: Path, ids: Iterable[str], seed: int) -> None:
         members = sorted((part for part in parts if part["drive"] == drive), key=lambda part: part["number"])
         _drive_tables(tables, seed, drive, members)
     write_png(root / "maps" / "placeholder.png", np.zeros((4, 4, 3), dtype=np.uint8))
-    names = [scene["name"] for scene in tables["scene"]]
-    every = min(VAL_EVERY, max(2, len(names)))
-    for name, is_val in (("train", False), ("val", True)):
-        chosen = [n for k, n in enumerate(names) if (k % every == every - 1) == is_val]
+    names = [[scene["name"]] for scene in tables["scene"]]
+    for name, chosen in zip(("train", "val"), split_groups(names), strict=True):
         write_text(root / f"{name}.txt", "".join(f"{n}\n" for n in chosen))
     for table, rows in tables.items():
         write_json(root / VERSION / f"{table}.json", rows, indent=0)

@@ -7,6 +7,7 @@ from typing import Final
 
 import numpy as np
 
+from lcf3d.simulation.meshes import buildings, plants
 from lcf3d.simulation.meshes import street as build
 from lcf3d.simulation.meshes.primitives import Mesh
 
@@ -57,21 +58,21 @@ def template(kind: str, variant: int) -> Mesh:
     """One of ``VARIANTS`` ready-made things, made when first used; plants and fences are stretched later."""
     rng = np.random.default_rng(7000 + variant)
     if kind == "tree":
-        return build.tree(8.5, 8.5 * float(rng.uniform(0.5, 0.7)), GREENS[variant % 5], 120, 0.32, rng)
+        return plants.tree(8.5, 8.5 * float(rng.uniform(0.5, 0.7)), GREENS[variant % 5], 120, 0.32, rng)
     if kind == "fine_tree":
-        return build.tree(8.5, 8.5 * float(rng.uniform(0.5, 0.7)), GREENS[variant % 5], 480, 0.135, rng)
+        return plants.tree(8.5, 8.5 * float(rng.uniform(0.5, 0.7)), GREENS[variant % 5], 480, 0.135, rng)
     if kind == "conifer":
-        return build.conifer(9.5, 3.8, (0.035, 0.065, 0.03), 300, rng)
+        return plants.conifer(9.5, 3.8, (0.035, 0.065, 0.03), 300, rng)
     if kind == "bush":
-        return build.bush(1.3, 1.2, 1.2, GREENS[variant % 5], 620, rng)
+        return plants.bush(1.3, 1.2, 1.2, GREENS[variant % 5], 620, rng)
     if kind == "hedge":
-        return build.hedge(5.0, 1.3, GREENS[variant], rng)
+        return plants.hedge(5.0, 1.3, GREENS[variant], rng)
     if kind == "undergrowth":
-        return build.undergrowth(4.4, 5.0, float(rng.uniform(0.9, 2.6)), 350, 0.30, GREENS[variant % 5], rng)
+        return plants.undergrowth(4.4, 5.0, float(rng.uniform(0.9, 2.6)), 350, 0.30, GREENS[variant % 5], rng)
     if kind == "fine_undergrowth":
-        return build.undergrowth(4.4, 5.0, float(rng.uniform(0.9, 2.6)), 1500, 0.14, GREENS[variant % 5], rng)
+        return plants.undergrowth(4.4, 5.0, float(rng.uniform(0.9, 2.6)), 1500, 0.14, GREENS[variant % 5], rng)
     if kind == "fence":
-        return build.fence(5.0, 1.1, variant == 1)
+        return buildings.fence(5.0, 1.1, variant == 1)
     if kind == "lamp":
         return build.street_lamp(6.0 + 2.0 * variant, 1.2)
     if kind == "sign":

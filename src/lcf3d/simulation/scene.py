@@ -18,7 +18,8 @@ from lcf3d.simulation.meshes.primitives import Mesh
 from lcf3d.simulation.obstacles import ObstacleMap
 from lcf3d.simulation.rays import RayTracer
 from lcf3d.simulation.roads import Path, make_terrain
-from lcf3d.simulation.scenery import Site, build_scenery
+from lcf3d.simulation.scenery import build_scenery
+from lcf3d.simulation.site import Site
 from lcf3d.simulation.streets import STREET_NAMES, STREETS
 from lcf3d.simulation.traffic import Crowd, populate
 from lcf3d.simulation.worlds import PLAIN, World

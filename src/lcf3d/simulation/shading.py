@@ -131,10 +131,6 @@ def shade(  # type: ignore[no-untyped-def]
             for k in range(3):
                 out[i, k] = mirror[k]
             continue
-        m = material[t]
-        kind = int(table[m, 0])
-        tile = table[m, 2]
-        specular, gloss = table[m, 3], table[m, 4]
         w = 1.0 - u[i] - v[i]
         s = w * uv[t, 0, 0] + u[i] * uv[t, 1, 0] + v[i] * uv[t, 2, 0]
         r = w * uv[t, 0, 1] + u[i] * uv[t, 1, 1] + v[i] * uv[t, 2, 1]
@@ -142,34 +138,13 @@ def shade(  # type: ignore[no-untyped-def]
         px, py, pz = position[i, 0], position[i, 1], position[i, 2]
         facing = max(-(dx * nx + dy * ny + dz * nz), 0.03)
         small = distance[i] * pixel_angle
-        large = min(small / facing, 60.0)
-        texture = int(table[m, 1])
-        glow = 0.0
         for k in range(3):
             albedo[k] = colour[t, k]
-        if kind == 3 or kind == 8:
-            _ground(textures, texture, tile, px, py, dx, dy, small, large, albedo)
-            if kind == 3:
-                specular = _carriageway(textures, texture, road, s, r, small, large, dx, dy, albedo, specular)
-            if light[16] > 0:
-                puddle = value_noise(px * 0.35, py * 0.35)
-                for k in range(3):
-                    albedo[k] *= 1 - 0.45 * light[16]
-                specular += light[16] * (0.02 + 0.10 * max(puddle - 0.45, 0.0))
-                gloss = 0.6
-        elif kind == 4:
-            sample(textures, texture, s * 2.7 / tile, r * 3.0 / tile, large / tile * SIZE, albedo)
-            window = facade(s, r, seed[t], large / 2.8, light[17], albedo)
-            if window > 0:
-                specular, gloss = 0.10 * window, 0.97
-            if window < 0:
-                glow = -window
-        elif kind == 6:
-            shade_k = 0.8 + 0.4 * seed[t]
-            for k in range(3):
-                albedo[k] *= shade_k
-        elif texture > 0:
-            sample(textures, texture, s / tile, r / tile, large / tile * SIZE, albedo)
+        row = table[material[t]]
+        kind = int(row[0])
+        specular, gloss, glow = _surface(
+            row, textures, road, light, s, r, px, py, dx, dy, small, min(small / facing, 60.0), seed[t], albedo
+        )
         _light_surface(
             kind,
             albedo,
@@ -196,6 +171,41 @@ def shade(  # type: ignore[no-untyped-def]
         far = 1 - math.exp(-distance[i] / light[15])
         for k in range(3):
             out[i, k] = out[i, k] * (1 - far) + light[12 + k] * far
+
+
+@kernel(inline="always")
+def _surface(row, textures, road, light, s, r, px, py, dx, dy, small, large, seed, albedo):  # type: ignore[no-untyped-def]
+    """Colour of a material at texture position (s, r) and place (px, py), into ``albedo``.
+
+    ``row`` is the material's of the table, ``small`` and ``large`` are the sides of the pixel's patch on the surface in
+    metres. Returns what it mirrors, how sharply, and how much it glows.
+    """
+    kind, texture, tile = int(row[0]), int(row[1]), row[2]
+    specular, gloss, glow = row[3], row[4], 0.0
+    if kind == 3 or kind == 8:
+        _ground(textures, texture, tile, px, py, dx, dy, small, large, albedo)
+        if kind == 3:
+            specular = _carriageway(textures, texture, road, s, r, small, large, dx, dy, albedo, specular)
+        if light[16] > 0:
+            puddle = value_noise(px * 0.35, py * 0.35)
+            for k in range(3):
+                albedo[k] *= 1 - 0.45 * light[16]
+            specular += light[16] * (0.02 + 0.10 * max(puddle - 0.45, 0.0))
+            gloss = 0.6
+    elif kind == 4:
+        sample(textures, texture, s * 2.7 / tile, r * 3.0 / tile, large / tile * SIZE, albedo)
+        window = facade(s, r, seed, large / 2.8, light[17], albedo)
+        if window > 0:
+            specular, gloss = 0.10 * window, 0.97
+        if window < 0:
+            glow = -window
+    elif kind == 6:
+        shade_k = 0.8 + 0.4 * seed
+        for k in range(3):
+            albedo[k] *= shade_k
+    elif texture > 0:
+        sample(textures, texture, s / tile, r / tile, large / tile * SIZE, albedo)
+    return specular, gloss, glow
 
 
 @kernel(inline="always")

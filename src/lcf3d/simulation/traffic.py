@@ -13,7 +13,7 @@ from lcf3d.errors import ConfigError
 from lcf3d.simulation.actors import Actor, Motion, actor_size, make_actor
 from lcf3d.simulation.obstacles import ObstacleMap
 from lcf3d.simulation.roads import Path
-from lcf3d.simulation.scenery import Site
+from lcf3d.simulation.site import Site
 
 _TRIES = 12
 ALWAYS_PLACED: Final = 5.0

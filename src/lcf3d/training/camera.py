@@ -39,6 +39,7 @@ class CameraTask:
         view: (height, width) of the views, multiples of 32.
         augmentation: how views are drawn.
         data: what the images are, in words.
+        begin: exported network whose weights are begun with, see `lcf3d.training.camera_start`.
     """
 
     images: Sequence[LabelledImage]
@@ -48,6 +49,7 @@ class CameraTask:
     view: tuple[int, int] = (192, 416)
     augmentation: Augmentation = field(default_factory=Augmentation)
     data: str = ""
+    begin: Path | None = None
 
     def __post_init__(self) -> None:
         if not self.images:
@@ -61,16 +63,22 @@ class CameraTask:
             raise ConfigError("these images have no instance masks to learn from; train with --no-masks")
 
     def network(self) -> SmallDetector:
-        """A detector with random weights."""
+        """A detector with random weights, or with those of the exported network that it begins with."""
         from lcf3d.detectors.camera.small_network import SmallDetector
 
         network: SmallDetector = SmallDetector(self.config).to(memory_format=import_torch().channels_last)
+        if self.begin is not None:
+            from lcf3d.training.camera_start import begin_with
+
+            begin_with(network, self.begin, self.batch(0, np.random.default_rng(7)))
         return network
 
     def described(self) -> dict[str, Any]:
         """What batches depend on, as plain data."""
         told = {"data": self.data, "images": len(self.images), "held_out": len(self.held_out)}
-        network = {"prototypes": self.config.prototypes}
+        network: dict[str, Any] = {"prototypes": self.config.prototypes}
+        if self.begin is not None:
+            network["begin"] = self.begin.name
         return {**told, **network, "batch_size": self.batch_size, "view": self.view, **asdict(self.augmentation)}
 
     def starting(self, weights: dict[str, Any]) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lcf3d.detectors.base import CameraDetector
-from lcf3d.geometry.iou import image_area, image_iou
+from lcf3d.geometry.iou import image_cover, image_iou
 from lcf3d.structures import KITTI_CLASSES, BoolArray, Detections2D, FloatArray, IntArray
 from lcf3d.training.camera_augmentation import LOWEST_HEIGHT
 from lcf3d.training.camera_images import IGNORED, LabelledImage
@@ -151,10 +151,7 @@ def _on_ignored(found: Detections2D, image: LabelledImage, labels: IntArray) -> 
     boxes = np.concatenate([image.boxes[labels < 0], image.visible[labels < 0]])
     if not len(boxes):
         return np.zeros(len(found), dtype=bool)
-    low = np.maximum(found.boxes[:, None, :2], boxes[None, :, :2])
-    high = np.minimum(found.boxes[:, None, 2:], boxes[None, :, 2:])
-    common = np.maximum(high - low, 0).prod(axis=2)
-    covered: BoolArray = (common.max(axis=1) / np.maximum(image_area(found.boxes), 1e-9)) > ON_IGNORED
+    covered: BoolArray = image_cover(found.boxes, boxes).max(axis=1) > ON_IGNORED
     return covered
 
 

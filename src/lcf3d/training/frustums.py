@@ -18,7 +18,7 @@ from lcf3d.formats.kitti import read_objects
 from lcf3d.fusion.frustum import enlarge_boxes, points_in_image_boxes
 from lcf3d.geometry.boxes import lidar_from_kitti, points_in_boxes, transform_boxes
 from lcf3d.geometry.camera import pixel_rays, project_boxes, project_points
-from lcf3d.geometry.iou import image_iou
+from lcf3d.geometry.iou import image_cover, image_iou
 from lcf3d.structures import BoolArray, Camera, Detections3D, FloatArray, IntArray
 from lcf3d.training.samples import ScanSample, read_scan
 
@@ -136,9 +136,9 @@ def frustums_of(scene: LabelledScene, classes: Mapping[str, int], rng: np.random
     objects = [_cut(scene, boxes2d[k], right_boxes[k], int(labels[k]), scene.boxes[k]) for k in rows]
     kept = [f for f in objects if f.inside.sum() >= FEWEST_ON_OBJECT]
     nothing = np.full(7, np.nan)
-    taken = boxes2d[visible] if scene.unknown2d is None else np.concatenate([boxes2d[visible], scene.unknown2d])
+    unknown = np.zeros((0, 4)) if scene.unknown2d is None else scene.unknown2d
     for _ in range(rng.binomial(len(kept), NEGATIVE_SHARE)):
-        box, label = _free_box(taken, kept[rng.integers(len(kept))], scene.camera, rng)
+        box, label = _free_box(boxes2d[visible], unknown, kept[rng.integers(len(kept))], scene.camera, rng)
         if box is not None:
             empty = _cut(scene, box, np.full(4, np.nan), label, nothing)
             if len(empty.points) >= 2 * FEWEST_ON_OBJECT:
@@ -147,16 +147,17 @@ def frustums_of(scene: LabelledScene, classes: Mapping[str, int], rng: np.random
 
 
 def _free_box(
-    taken: FloatArray, like: PooledFrustum, camera: Camera, rng: np.random.Generator
+    taken: FloatArray, unknown: FloatArray, like: PooledFrustum, camera: Camera, rng: np.random.Generator
 ) -> tuple[FloatArray | None, int]:
-    """A 2D box like another's, moved sideways to where no object is; None where there is no room."""
+    """A 2D box like another's, moved sideways to where no object is and nothing unknown; None without room for it."""
     for _ in range(5):
         width = float(like.box2d[2] - like.box2d[0])
         x = rng.uniform(0, max(camera.width - width, 1.0))
         y = float(rng.normal(0, 0.1)) * float(like.box2d[3] - like.box2d[1])
         box = np.array([x, like.box2d[1] + y, x + width, like.box2d[3] + y])
         box[1::2] = np.clip(box[1::2], 0, camera.height)
-        if box[3] - box[1] >= LOWEST_PX and (image_iou(box[None], taken) < FREE_IOU).all():
+        free = (image_iou(box[None], taken) < FREE_IOU).all() and (image_cover(box[None], unknown) < FREE_IOU).all()
+        if box[3] - box[1] >= LOWEST_PX and free:
             return box, like.label
     return None, like.label
 

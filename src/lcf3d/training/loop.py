@@ -241,8 +241,7 @@ class _Run:
         load_parameters(self.averaged, weights, str(path))
 
     def begin(self) -> int:
-        if (self.folder / LAST).exists():
-            raise ConfigError(f"{self.folder} holds a training already; go on with --resume, or choose another folder")
+        require_unused(self.folder)
         if self.rank == 0:
             write_json(self.folder / "settings.json", asdict(self.settings))
         return 0
@@ -322,6 +321,16 @@ class _Run:
     def close(self) -> None:
         if self._writer is not None:
             self._writer.close()
+
+
+def require_unused(folder: Path) -> None:
+    """See that a new training may begin in a folder.
+
+    Raises:
+        ConfigError: it holds one already.
+    """
+    if (folder / LAST).exists():
+        raise ConfigError(f"{folder} holds a training already; go on with --resume, or choose another folder")
 
 
 def import_torch() -> Any:

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import PIL.Image
 import PIL.ImageOps
+from isal import isal_zlib
 from numpy.typing import NDArray
 
 from lcf3d.files import atomic_path
@@ -18,7 +19,6 @@ from lcf3d.structures import Camera
 from lcf3d.visualization.bev import BevView, bev_canvas
 from lcf3d.visualization.camera_view import camera_canvas
 from lcf3d.visualization.canvas import Canvas, Colour, plain, text_size
-from lcf3d.visualization.deflate import compress
 from lcf3d.visualization.scene import CAMERA_COLOUR, COLOURS, TRUTH_COLOUR, Scene
 from lcf3d.visualization.scratch import scratch
 
@@ -29,6 +29,8 @@ GRID_COLUMNS = 3
 GRID_WIDTH = 1680
 BEV_HEIGHT = 640
 SURROUND_BEV_HEIGHT = 840
+# level of ISA-L: a fifth of the time of zlib's lowest, and as small
+_FAST = 1
 # of a moving picture whose frames tell no time
 GIF_MS = 200
 
@@ -110,8 +112,9 @@ def png_bytes(pixels: NDArray[np.uint8]) -> bytes:
     filtered[:, 0] = 1
     filtered[:, 1:4] = rows[:, :3]
     np.subtract(rows[:, 3:], rows[:, :-3], out=filtered[:, 4:])
+    packed = isal_zlib.compress(filtered.data, _FAST)
     header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
-    chunks = ((b"IHDR", header), (b"IDAT", compress(filtered.reshape(-1))), (b"IEND", b""))
+    chunks = ((b"IHDR", header), (b"IDAT", packed), (b"IEND", b""))
     return b"\x89PNG\r\n\x1a\n" + b"".join(
         struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)) for kind, data in chunks
     )

@@ -20,7 +20,7 @@ from lcf3d.detectors.camera.torchvision_boxes import (  # noqa: E402
 )
 from lcf3d.detectors.camera.torchvision_fasterrcnn import FasterRCNNNetwork, TorchvisionFasterRCNN  # noqa: E402
 from lcf3d.detectors.camera.torchvision_masks import instance_masks  # noqa: E402
-from lcf3d.detectors.camera.torchvision_styles import STYLES, find_style, normalization_of  # noqa: E402
+from lcf3d.detectors.camera.torchvision_styles import STYLES, find_style, normalization_of, parse_size  # noqa: E402
 from lcf3d.detectors.classes import COCO_CLASSES  # noqa: E402
 from lcf3d.errors import ConfigError, DetectorError, ShapeError  # noqa: E402
 
@@ -84,8 +84,11 @@ def random_file(tmp_path_factory):
 
 
 def test_a_checkpoint_runs_and_keeps_pixels_of_the_image(random_file):
-    detector = TorchvisionFasterRCNN(random_file, class_names=("Car", "Pedestrian", "Cyclist"), score_threshold=0.0)
-    detector.style = replace(detector.style, image_size=(320, 320))
+    detector = TorchvisionFasterRCNN(
+        random_file, class_names=("Car", "Pedestrian", "Cyclist"), score_threshold=0.0, size="320x320"
+    )
+    # 160 x 90 pixels fit twice, and are padded to multiples of 32
+    assert detector.prepare(np.zeros((90, 160, 3), np.uint8))[0].shape == (1, 3, 192, 320)
     found = detector([np.zeros((90, 160, 3), np.uint8)])[0]
     assert found.class_names == ("Car", "Pedestrian", "Cyclist")
     assert len(found) > 0
@@ -94,6 +97,12 @@ def test_a_checkpoint_runs_and_keeps_pixels_of_the_image(random_file):
     assert found.boxes[:, 3].max() <= 90
     with pytest.raises(ShapeError, match=r"\(H, W, 3\)"):
         detector([np.zeros((90, 160), np.uint8)])
+
+
+@pytest.mark.parametrize("size", ["320", "225x400", "400x20", "x", "400x225px"])
+def test_sizes_that_are_none(size):
+    with pytest.raises(ConfigError, match="size must read LONGERxSHORTER"):
+        parse_size(size)
 
 
 def test_checkpoints_of_other_networks(random_file):

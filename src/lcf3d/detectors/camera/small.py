@@ -41,8 +41,16 @@ def shipped(
         ConfigError: there is no detector of that name, or a setting makes no sense.
         DetectorError: its file is missing or damaged.
     """
+    path = shipped_path(name)
+    return OnnxDetector(path, class_names, tiles, score_threshold, iou_threshold, "auto", size, threads=threads)
+
+
+def shipped_path(name: str) -> Path:
+    """The file of a detector that comes with the package.
+
+    Raises:
+        ConfigError: there is no detector of that name.
+    """
     if name not in SHIPPED:
         raise ConfigError(f"no camera detector {name!r} comes with lcf3d; it ships: {', '.join(SHIPPED)}")
-    return OnnxDetector(
-        MODELS / SHIPPED[name], class_names, tiles, score_threshold, iou_threshold, "auto", size, threads=threads
-    )
+    return MODELS / SHIPPED[name]

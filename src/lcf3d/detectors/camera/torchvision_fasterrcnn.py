@@ -8,6 +8,7 @@ suppression) is in `STYLES`. With a mask head it is Mask R-CNN (He et al., ICCV 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,7 @@ from lcf3d.detectors.camera.torchvision_styles import (
     find_style,
     normalization_of,
     normalized,
+    parse_size,
 )
 from lcf3d.detectors.classes import reported_classes, to_classes
 from lcf3d.detectors.downloads import local_path
@@ -155,11 +157,15 @@ class TorchvisionFasterRCNN:
         device: torch device.
         normalization: ``pytorch`` or ``caffe``, how images were normalized in training; without it what the
             configuration in the file says, or else the style's.
+        size: ``LONGERxSHORTER`` sides that images are brought into, in pixels; those of its training without it.
+            Smaller is quicker and finds less.
 
     Raises:
         DetectorError: the file cannot be read, or is no Faster or Mask R-CNN with ResNet-50 or -101 and FPN.
-        ConfigError: unknown style, normalization or device.
+        ConfigError: unknown style, normalization or device, or a size that is none.
     """
+
+    style: Style
 
     def __init__(
         self,
@@ -169,12 +175,14 @@ class TorchvisionFasterRCNN:
         style: str | None = None,
         device: str = "cpu",
         normalization: str | None = None,
+        size: str | None = None,
     ) -> None:
         file = local_path(str(path), "camera")
         state = read_state_dict(file)
         config, classes = read_notes(file)
         told = normalization or normalization_of(config)
-        self._setup(state, class_names, score_threshold, style, device, told, classes)
+        image_size = None if size is None else parse_size(size)
+        self._setup(state, class_names, score_threshold, style, device, told, classes, image_size)
 
     @classmethod
     def from_state_dict(cls, state: Mapping[str, Any], **options: Any) -> TorchvisionFasterRCNN:
@@ -193,11 +201,13 @@ class TorchvisionFasterRCNN:
         device: str,
         normalization: str | None,
         classes: tuple[str, ...] = (),
+        image_size: tuple[int, int] | None = None,
     ) -> None:
         torchvision()
         if style is not None and style not in STYLES:
             raise ConfigError(f"style must be one of {', '.join(STYLES)}, got {style!r}")
         found = STYLES[style] if style is not None else find_style(state, classes)
+        found = found if image_size is None else replace(found, image_size=image_size)
         self.style = found if normalization is None else normalized(found, normalization)
         depth = 101 if "backbone.layer3.22.conv1.weight" in state else 50
         self.has_masks = any(name.startswith("roi_head.mask_head.") for name in state)
@@ -243,7 +253,8 @@ class TorchvisionFasterRCNN:
         longer, shorter = self.style.image_size
         scale = min(longer / max(image.shape[:2]), shorter / min(image.shape[:2]))
         size = tuple(round(side * scale) for side in image.shape[:2])
-        tensor = torch.from_numpy(np.ascontiguousarray(image)).to(self.device).permute(2, 0, 1)[None].float()
+        # a copy, because images of datasets are read-only, which torch warns of
+        tensor = torch.from_numpy(np.array(image, order="C")).to(self.device).permute(2, 0, 1)[None].float()
         if size != image.shape[:2]:
             tensor = functional.interpolate(tensor, size=size, mode="bilinear", align_corners=False)
         return self.normalize(tensor), scale

@@ -99,7 +99,7 @@ class TorchvisionDetector:
     def _detect(self, image: Image) -> Detections2D:
         if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or not image.size:
             raise ShapeError(f"an image must be (H, W, 3) uint8 RGB, got {image.shape} {image.dtype}")
-        tensor = torch.from_numpy(np.ascontiguousarray(image)).to(self.device).permute(2, 0, 1).float() / 255
+        tensor = torch.from_numpy(np.array(image, order="C")).to(self.device).permute(2, 0, 1).float() / 255
         with torch.inference_mode():
             output = {key: value.cpu().numpy() for key, value in self.network([tensor])[0].items()}
         mapped = to_classes(self._convert(output), self.class_names)

@@ -124,6 +124,21 @@ def normalization_of(config: str) -> str | None:
     return {"True": "pytorch", "False": "caffe"}[order.group(1)] if order else None
 
 
+def parse_size(text: str) -> tuple[int, int]:
+    """Longer and shorter side from ``LONGERxSHORTER``, in pixels.
+
+    Raises:
+        ConfigError: not of that form, or too small for the coarsest cells of the pyramid.
+    """
+    found = re.fullmatch(r"(\d{2,5})x(\d{2,5})", text)
+    sides = (int(found.group(1)), int(found.group(2))) if found else (0, 0)
+    if min(sides) < 64 or sides[0] < sides[1]:
+        raise ConfigError(
+            f"size must read LONGERxSHORTER, in pixels and 64 or more, for example 1333x800, got {text!r}"
+        )
+    return sides
+
+
 def find_style(state: Mapping[str, Any], classes: tuple[str, ...] = ()) -> Style:
     """The style whose numbers of classes and anchors are those of the parameters.
 
