@@ -40,20 +40,39 @@ def font(size: float) -> PIL.ImageFont.FreeTypeFont | PIL.ImageFont.ImageFont:
     return PIL.ImageFont.load_default(size)
 
 
-# words come again and again; shaping and drawing one takes longer than all else about a label
-@lru_cache(maxsize=8192)
 def text_size(text: str, size: float) -> tuple[int, int]:
     """Width and line height of a text in pixels."""
-    return int(np.ceil(font(size).getlength(text))), int(np.ceil(size * 1.25))
+    words = text.split(" ")
+    length = sum(_length(word, size) for word in words) + (len(words) - 1) * _length(" ", size)
+    return int(np.ceil(length)), int(np.ceil(size * 1.25))
+
+
+# words come again and again; shaping and drawing one takes longer than all else about a label
+@lru_cache(maxsize=8192)
+def _length(word: str, size: float) -> float:
+    return float(font(size).getlength(word))
 
 
 @lru_cache(maxsize=8192)
+def _word(word: str, size: float, height: int) -> NDArray[np.uint8]:
+    """How much of each pixel a word covers, with a pixel of room before it."""
+    picture = PIL.Image.new("L", (int(np.ceil(_length(word, size))) + 3, height))
+    PIL.ImageDraw.Draw(picture).text((1, height / 2), word, fill=255, font=font(size), anchor="lm")
+    return np.array(picture)
+
+
+@lru_cache(maxsize=1024)
 def text_mask(text: str, size: float, width: int, height: int) -> NDArray[np.uint8]:
     """(height, width) how much of each pixel a text covers, 255 for all of it; centred between top and bottom."""
-    picture = PIL.Image.new("L", (width, height))
-    place = (_LABEL_PADDING, height / 2)
-    PIL.ImageDraw.Draw(picture).text(place, text, fill=255, font=font(size), anchor="lm")
-    return np.array(picture)
+    mask = np.zeros((height, width), np.uint8)
+    x = float(_LABEL_PADDING)
+    for word in text.split(" "):
+        drawn = _word(word, size, height)
+        left = round(x) - 1
+        part = mask[:, left : left + drawn.shape[1]]
+        np.maximum(part, drawn[:, : part.shape[1]], out=part)
+        x += _length(word, size) + _length(" ", size)
+    return mask
 
 
 def plain(height: int, width: int, colour: Sequence[int]) -> NDArray[np.uint8]:
