@@ -282,7 +282,7 @@ def _draw_labels(axes: Any, sides: Sequence[tuple[float, LabelStatistics, str, s
     axes[1, 2].set(title="distance of labels (m)")
     axes[0, 3].set(title="labels of occlusion 0, 1, 2, 3 (share)")
     lowest = ", ".join(f"{edge:g}" for edge in HEIGHT_EDGES[:-1])
-    axes[1, 3].set(title=f"labels of {lowest} and more pixels (share)")
+    axes[1, 3].set(title=f"share of labels over {lowest} px")
 
 
 def _draw_shares(axis: Any, shift: float, shares: Mapping[str, FloatArray], name: str, colour: str) -> None:
