@@ -82,3 +82,12 @@ def test_traffic_that_moves_along_and_a_sensor_that_stands_teach_nothing():
     assert memory.odometry.scale == 1.0
     memory, _ = memory_after(drive(1.03, traffic=False, speed=0.5))
     assert memory.odometry.scale == 1.0
+
+
+@pytest.mark.parametrize(("speed", "remembered"), [(0.0, True), (10.0, False)])
+def test_what_stands_is_remembered_for_longer_than_what_moves(speed, remembered):
+    rng = np.random.default_rng(0)
+    seen = [(frame(0.1 * t), fused([jittered(10 + speed * 0.1 * t, 3, rng)], [0.97])) for t in range(20)]
+    # unseen for 1.7 s, of 1.55 s for what moves and 2.05 s for what stands
+    memory, _ = memory_after([*seen, *((frame(0.1 * t), fused([], [])) for t in range(20, 37))])
+    assert (len(memory.tracks) == 1) == remembered

@@ -290,8 +290,12 @@ def _assemble(
 
 
 def _bounded(tracks: Tracks, time: float, config: MemoryConfig) -> Tracks:
-    """The tracks worth keeping: seen within the horizon, at most as many as the settings allow."""
-    recent = time - tracks.seen <= config.horizon_s
+    """The tracks worth keeping: seen within the horizon, at most as many as the settings allow.
+
+    What stands is where it was, what moves is soon elsewhere: the horizon lies between both by how probable each is.
+    """
+    moving = min(config.moving_horizon_s, config.horizon_s)
+    recent = time - tracks.seen <= moving + tracks.standing * (config.horizon_s - moving)
     if not recent.all():
         tracks = tracks[recent]
     if len(tracks) <= config.max_tracks:
