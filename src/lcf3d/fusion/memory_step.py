@@ -130,10 +130,17 @@ def step(memory: Memory, tracks: Tracks, fused: FusedDetections, moment: Moment)
 
 
 def _odometry(memory: Memory, tracks: Tracks, moment: Moment) -> tuple[Odometry, FloatArray | None]:
-    """What is known of the poses' scale after the frame, and the memory's world from theirs."""
+    """What is known of the poses' scale after the frame, and the memory's world from theirs.
+
+    Where poses are missing, the world goes on by what the objects say, and poses that come again join it there.
+    """
     given, known, world_from_dataset = moment.frame.world_from_lidar, memory.odometry, memory.world_from_dataset
     elapsed = moment.time_s - memory.time_s
-    if given is None or world_from_dataset is None or elapsed <= 0:
+    if given is None:
+        return known, None
+    if world_from_dataset is None:
+        return known, moment.world_from_lidar @ invert_rigid(given)
+    if elapsed <= 0:
         return known, world_from_dataset
     here, before = moment.world_from_lidar[:3, 3], memory.world_from_lidar[:3, 3]
     moved = world_from_dataset.copy()
