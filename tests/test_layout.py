@@ -19,6 +19,7 @@ FLOORS = (
         "files",
         "reasons",
         "provenance",
+        "decisions",
         "plugins",
         "processes",
         "kernels",
