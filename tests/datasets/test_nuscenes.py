@@ -8,6 +8,7 @@ from PIL import Image
 from lcf3d.datasets.nuscenes import NuscenesDataset, find_version, read_lidar
 from lcf3d.datasets.nuscenes_annotations import annotation_velocities
 from lcf3d.datasets.nuscenes_loading import load_tables
+from lcf3d.datasets.nuscenes_results import NuscenesLidarResults
 from lcf3d.datasets.nuscenes_splits import SPLITS, default_split, scenes_of_split
 from lcf3d.errors import ConfigError, DatasetError, FormatError
 from lcf3d.geometry.boxes import CORNER_SIGNS, points_in_boxes
@@ -306,6 +307,19 @@ def test_the_complete_frame(shared: Path) -> None:
     stated = annotations.point_counts[annotations.point_counts >= 1]
     # those stated include radar points, and our boxes stand upright in the LiDAR frame
     assert np.corrcoef(counted, stated)[0, 1] > 0.999
+
+
+@pytest.mark.parametrize(("second", "known"), [([0.0, 0.0], False), ([0.0, 0.1], True)])
+def test_a_file_of_velocities_that_are_all_zero_knows_none(world: Path, second: list[float], known: bool) -> None:
+    box = np.array([[10, 0, 0, 4, 2, 1.5, 0.0]])
+    label = [NUSCENES_CLASSES.index("car")]
+    frames = {
+        token: Detections3D(box, [0.9], label, NUSCENES_CLASSES, velocities=np.array([velocity]))
+        for token, velocity in zip(SAMPLES, ([0.0, 0.0], second, [0.0, 0.0]), strict=True)
+    }
+    source = NuscenesLidarResults(Path("results.json"), frames, NUSCENES_CLASSES)
+    found = [source.detect(frame).velocities for frame in NuscenesDataset(world)]
+    assert [velocity is not None for velocity in found] == [known] * 3
 
 
 @pytest.mark.real

@@ -30,6 +30,25 @@ def test_tracked_classes_only_best_first_in_the_global_frame(tmp_path):
     assert results["a"][0]["velocity"] == [0, 0]
 
 
+def test_fields_are_those_of_the_official_format(tmp_path):
+    results = write(tmp_path / "tracking.json", [3, 4, 5])
+    fields = {"sample_token": str, "translation": 3, "size": 3, "rotation": 4, "velocity": 2}
+    fields |= {"tracking_id": str, "tracking_name": str, "tracking_score": float}
+    for token, boxes in results.items():
+        assert len({box["tracking_id"] for box in boxes}) == len(boxes)
+        for box in boxes:
+            assert box.keys() == fields.keys()
+            assert box["sample_token"] == token
+            assert all(isinstance(box[key], kind) for key, kind in fields.items() if isinstance(kind, type))
+            lists = {key: kind for key, kind in fields.items() if isinstance(kind, int)}
+            assert all(len(box[key]) == n and all(type(v) is float for v in box[key]) for key, n in lists.items())
+    # width, length, height; w, x, y, z
+    assert results["a"][0]["size"] == [1.8, 4, 1.5]
+    assert results["a"][0]["rotation"] == pytest.approx([1, 0, 0, 0])
+    meta = json.loads((tmp_path / "tracking.json").read_text())["meta"]
+    assert meta.keys() == {"use_camera", "use_lidar", "use_radar", "use_map", "use_external"}
+
+
 def test_ids_must_fit_the_boxes(tmp_path):
     with pytest.raises(FormatError, match="3 boxes but 2 track ids"):
         write(tmp_path / "tracking.json", [3, 4])

@@ -82,3 +82,27 @@ def test_traffic_that_moves_along_and_a_sensor_that_stands_teach_nothing():
     assert memory.odometry.scale == 1.0
     memory, _ = memory_after(drive(1.03, traffic=False, speed=0.5))
     assert memory.odometry.scale == 1.0
+
+
+@pytest.mark.parametrize(("speed", "remembered"), [(0.0, True), (10.0, False)])
+def test_what_stands_is_remembered_for_longer_than_what_moves(speed, remembered):
+    rng = np.random.default_rng(0)
+    seen = [(frame(0.1 * t), fused([jittered(10 + speed * 0.1 * t, 3, rng)], [0.97])) for t in range(20)]
+    # unseen for 1.7 s, of 1.55 s for what moves and 2.05 s for what stands
+    memory, _ = memory_after([*seen, *((frame(0.1 * t), fused([], [])) for t in range(20, 37))])
+    assert (len(memory.tracks) == 1) == remembered
+
+
+def test_poses_that_are_missing_for_a_while_are_told_and_come_again_without_a_jump():
+    frames = list(drive(1.0, traffic=False))
+    # the second odometry begins at a place of its own, two metres ahead
+    other = [
+        frame(0.1 * t, None if t < 20 else moved(1.0 * t + 2.0)) if t >= 15 else one for t, (one, _) in enumerate(frames)
+    ]
+    _, results = memory_after(zip(other, (found for _, found in frames), strict=True))
+    estimated = [any("no pose" in note for note in result.notes) for result in results]
+    assert estimated == [15 <= t <= 20 for t in range(30)]
+    assert not any("began anew" in note for result in results for note in result.notes)
+    assert {tuple(sorted(result.tracks.ids)) for result in results} == {(0, 1, 2, 3, 4, 5)}
+    speeds = np.linalg.norm(results[-1].detections.velocities, axis=1)
+    assert speeds.max() < 0.5

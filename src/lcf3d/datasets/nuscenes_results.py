@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,9 @@ from lcf3d.structures import Detections2D, Detections3D, IntArray
 class NuscenesLidarResults:
     """3D detections of a nuScenes submission file.
 
+    The format wants a velocity of every box, and detectors that measure none write zeros. Where all of a file's boxes
+    stand perfectly still, their velocities are taken as unknown, so that a memory may fill them in.
+
     Args:
         path: of the file, for messages.
         frames: by sample token, in canonical LiDAR frames.
@@ -29,7 +33,7 @@ class NuscenesLidarResults:
     def __init__(
         self, path: Path, frames: Mapping[str, Detections3D], class_names: Sequence[str], missing: str = "error"
     ) -> None:
-        self.path, self._frames, self.missing = path, frames, missing
+        self.path, self._frames, self.missing = path, _without_zero_velocities(frames), missing
         self.class_names = tuple(class_names)
         self.left_out = LeftOut(path)
 
@@ -71,6 +75,13 @@ class NuscenesLidarResults:
         if found is None:
             return Detections3D.empty(self.class_names)
         return found.with_classes(self.class_names, join_classes(found.class_names, self.class_names))
+
+
+def _without_zero_velocities(frames: Mapping[str, Detections3D]) -> Mapping[str, Detections3D]:
+    """The same frames, without velocities where all of them are exactly zero."""
+    if any(found.velocities is not None and found.velocities.any() for found in frames.values()):
+        return frames
+    return {token: replace(found, velocities=None) for token, found in frames.items()}
 
 
 class NuscenesCameraResults:

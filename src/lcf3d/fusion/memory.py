@@ -93,6 +93,8 @@ def remember(
     if pose is not None:
         pose = stretched(pose, memory.world_from_lidar, memory.odometry.scale)
     else:
+        note = "no pose that joins the frame before: the memory estimated the sensor's motion from the objects"
+        fused = replace(fused, notes=(*fused.notes, note))
         pose, velocity = estimate_pose(
             tracks, detections.boxes, detections.labels, memory.world_from_lidar, memory.ego_velocity, elapsed
         )
@@ -100,7 +102,7 @@ def remember(
 
 
 def _given_pose(memory: Memory, frame: Frame) -> FloatArray | None:
-    """(4, 4) pose of the LiDAR in the memory's world; None where the frame, or the memory's first, has none."""
+    """(4, 4) pose of the LiDAR in the memory's world; None where this frame, or the one before, has none."""
     if memory.world_from_dataset is None or frame.world_from_lidar is None:
         return None
     pose: FloatArray = memory.world_from_dataset @ frame.world_from_lidar

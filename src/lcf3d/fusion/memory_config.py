@@ -83,6 +83,8 @@ class MemoryConfig(BaseModel):
         classes: by class name; names left out get what their name says (car, pedestrian, ...), else the defaults of
             `ClassMemory`.
         horizon_s: a track not seen for longer is forgotten, and no box is predicted for it.
+        moving_horizon_s: the same for what surely moves, not longer than ``horizon_s``; between the two it goes by how
+            probable it is that the object stands.
         max_gap_s: after a longer gap between frames the memory begins anew.
         max_tracks: only so many tracks, those seen last and best supported, are kept.
         min_hits: frames that must have seen an object before boxes are predicted for it.
@@ -95,6 +97,7 @@ class MemoryConfig(BaseModel):
 
     classes: dict[str, ClassMemory] = Field(default_factory=dict)
     horizon_s: Positive = 2.05
+    moving_horizon_s: Positive = 1.55
     max_gap_s: Positive = 1.05
     max_tracks: int = Field(default=300, ge=1)
     min_hits: int = Field(default=2, ge=1)

@@ -131,10 +131,17 @@ def step(memory: Memory, tracks: Tracks, fused: FusedDetections, moment: Moment)
 
 
 def _odometry(memory: Memory, tracks: Tracks, moment: Moment) -> tuple[Odometry, FloatArray | None]:
-    """What is known of the poses' scale after the frame, and the memory's world from theirs."""
+    """What is known of the poses' scale after the frame, and the memory's world from theirs.
+
+    Where poses are missing, the world goes on by what the objects say, and poses that come again join it there.
+    """
     given, known, world_from_dataset = moment.frame.world_from_lidar, memory.odometry, memory.world_from_dataset
     elapsed = moment.time_s - memory.time_s
-    if given is None or world_from_dataset is None or elapsed <= 0:
+    if given is None:
+        return known, None
+    if world_from_dataset is None:
+        return known, moment.world_from_lidar @ invert_rigid(given)
+    if elapsed <= 0:
         return known, world_from_dataset
     here, before = moment.world_from_lidar[:3, 3], memory.world_from_lidar[:3, 3]
     moved = world_from_dataset.copy()
@@ -291,8 +298,12 @@ def _assemble(
 
 
 def _bounded(tracks: Tracks, time: float, config: MemoryConfig) -> Tracks:
-    """The tracks worth keeping: seen within the horizon, at most as many as the settings allow."""
-    recent = time - tracks.seen <= config.horizon_s
+    """The tracks worth keeping: seen within the horizon, at most as many as the settings allow.
+
+    What stands is where it was, what moves is soon elsewhere: the horizon lies between both by how probable each is.
+    """
+    moving = min(config.moving_horizon_s, config.horizon_s)
+    recent = time - tracks.seen <= moving + tracks.standing * (config.horizon_s - moving)
     if not recent.all():
         tracks = tracks[recent]
     if len(tracks) <= config.max_tracks:
