@@ -23,6 +23,7 @@ import numpy as np
 
 from lcf3d.datasets.kitti import KittiDataset
 from lcf3d.datasets.kitti_results import image_boxes
+from lcf3d.decisions import Decisions
 from lcf3d.evaluation.curves import average_precision, precision_recall, resampled_curves
 from lcf3d.evaluation.kitti import DIFFICULTIES, KittiEvaluator, Selection
 from lcf3d.formats.kitti import KittiFrames, objects_from_detections, read_folder
@@ -35,7 +36,7 @@ from lcf3d.fusion.memory_config import MemoryConfig
 from lcf3d.fusion.memory_smooth import smooth_sequence
 from lcf3d.fusion.pipeline import LateCascadeFusion
 from lcf3d.geometry.iou import bev_iou
-from lcf3d.provenance import Decisions, FusedDetections
+from lcf3d.provenance import FusedDetections
 from lcf3d.run.folder import RunFolder
 from lcf3d.structures import Detections2D, Detections3D, FloatArray, IntArray
 

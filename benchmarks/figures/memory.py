@@ -7,10 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
+from lcf3d.decisions import Decisions
 from lcf3d.frame import Frame
 from lcf3d.fusion.memory import remember_sequence
 from lcf3d.geometry.boxes import bev_corners
-from lcf3d.provenance import Decisions, FusedDetections
+from lcf3d.provenance import FusedDetections
 from lcf3d.reasons import Outcome
 from lcf3d.structures import KITTI_CLASSES, Camera, Detections2D, Detections3D
 

@@ -1,6 +1,7 @@
 """Argoverse 2 and KITTI's drives through the verbs of the command line."""
 
 import json
+import socket
 from pathlib import Path
 
 import pytest
@@ -121,7 +122,14 @@ def test_frames_of_a_drive_remember(argoverse: Path, option: str) -> None:
 def test_serve_at_its_port(argoverse: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("starlette", reason="needs starlette (extra serve)")
     ports: list[int] = []
-    monkeypatch.setattr("lcf3d.evaluation.server.serve", lambda app, port: ports.append(port))
+
+    def note_port(application: object, listening: socket.socket) -> None:
+        ports.append(listening.getsockname()[1])
+        listening.close()
+
+    monkeypatch.setattr("lcf3d.evaluation.server.serve", note_port)
     run_argoverse(argoverse)
-    lcf3d("serve", argoverse / "out", "--port", "8123")
-    assert ports == [8123]
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    lcf3d("serve", argoverse / "out", "--port", port)
+    assert ports == [port]

@@ -11,9 +11,10 @@ from typer.testing import CliRunner
 from lcf3d.cli.app import app
 from lcf3d.datasets.kitti import KittiDataset
 from lcf3d.datasets.opening import open_dataset
+from lcf3d.decisions import Decisions
 from lcf3d.errors import ConfigError, DatasetError
 from lcf3d.fusion.config import FusionConfig
-from lcf3d.provenance import Decisions, FusedDetections
+from lcf3d.provenance import FusedDetections
 from lcf3d.reasons import Outcome, Reason
 from lcf3d.run.folder import RunFolder
 from lcf3d.run.table_folder import open_run_folder

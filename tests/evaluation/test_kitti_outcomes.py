@@ -4,12 +4,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lcf3d.decisions import Decisions
 from lcf3d.errors import FormatError
 from lcf3d.evaluation.kitti import KittiEvaluator, Selection
 from lcf3d.evaluation.kitti_outcomes import fusion_outcomes, read_provenance, working_point
 from lcf3d.evaluation.kitti_study import study
 from lcf3d.geometry.boxes import lidar_from_kitti
-from lcf3d.provenance import Decisions, FusedDetections
+from lcf3d.provenance import FusedDetections
 from lcf3d.reasons import Outcome, Reason
 from lcf3d.structures import Detections2D, Detections3D
 

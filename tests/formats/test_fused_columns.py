@@ -9,7 +9,8 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from lcf3d.provenance import Decisions, FusedDetections, TrackTable
+from lcf3d.decisions import Decisions, TrackTable
+from lcf3d.provenance import FusedDetections
 from lcf3d.reasons import OUTCOMES, REASONS
 from lcf3d.structures import Detections2D, Detections3D
 
@@ -119,7 +120,7 @@ def test_columns_are_made_without_pandas():
     program = f"""
 import sys
 import lcf3d.formats.fused_table as tables
-from formats.test_fused_columns import FRAMES
+from tests.formats.test_fused_columns import FRAMES
 from pathlib import Path
 tables.write_frames(Path(sys.argv[1]) / "a.parquet", FRAMES)
 tables.write_detections(Path(sys.argv[1]) / "b.parquet", FRAMES)

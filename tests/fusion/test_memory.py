@@ -8,12 +8,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from lcf3d.decisions import Decisions
 from lcf3d.errors import ConfigError
 from lcf3d.frame import Frame
 from lcf3d.fusion.evidence import to_log_odds
 from lcf3d.fusion.memory import remember, remember_sequence
 from lcf3d.fusion.memory_config import ClassMemory, MemoryConfig
-from lcf3d.provenance import Decisions, FusedDetections
+from lcf3d.provenance import FusedDetections
 from lcf3d.reasons import Outcome
 from lcf3d.structures import KITTI_CLASSES, Detections2D, Detections3D
 

@@ -12,9 +12,9 @@ import pytest
 import lcf3d
 from lcf3d import plugins
 from lcf3d.datasets.opening import open_dataset
+from lcf3d.decisions import TrackTable
 from lcf3d.errors import ConfigError, FormatError
 from lcf3d.formats.fused_table import read_frames, write_frames
-from lcf3d.provenance import TrackTable
 from lcf3d.run.conversion import convert_run
 from lcf3d.run.export import export_run
 from lcf3d.run.shards import frames_of_shard, merge_shards, parse_shard

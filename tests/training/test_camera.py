@@ -140,7 +140,7 @@ def test_the_command_trains_and_exports(tmp_path: Path, monkeypatch: pytest.Monk
     assert [image is IMAGES[2] for image in measured[-1]] == [True]
     again = CliRunner().invoke(app, arguments)
     assert isinstance(again.exception, ConfigError)
-    few = CliRunner().invoke(app, ["--out", str(tmp_path), "--held-out", "3"])
+    few = CliRunner().invoke(app, ["--out", str(tmp_path / "few"), "--held-out", "3"])
     assert "lower --held-out" in str(few.exception)
-    masks = CliRunner().invoke(app, [f"kitti:{tmp_path}", "--out", str(tmp_path)])
+    masks = CliRunner().invoke(app, [f"kitti:{tmp_path}", "--out", str(tmp_path / "masks")])
     assert "--no-masks" in str(masks.exception)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lcf3d.provenance import Decisions, FusedDetections
+from lcf3d.decisions import Decisions
+from lcf3d.provenance import FusedDetections
 from lcf3d.reasons import Outcome, Reason
 from lcf3d.structures import Camera, Detections2D, Detections3D
 

@@ -8,14 +8,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from lcf3d.errors import ConfigError, Lcf3dError
-
-FAILED = "not measured:"
-"""How the note of a row begins whose run failed."""
+from lcf3d.errors import ConfigError
 
 if TYPE_CHECKING:
     from lcf3d.paper.tables import Row, Table
-    from lcf3d.paper.workplace import Measured, Workplace
 
 
 def paper(
@@ -85,28 +81,19 @@ def paper(
             raise ConfigError(f"--{kind} {folder}: there is no such folder")
     if rehearse:
         from lcf3d.paper.cost import networks_of
-        from lcf3d.paper.rehearsal import filled_weights
+        from lcf3d.paper.rehearsal import filled_weights, simulated_data
 
         names = {name for one, rows in chosen for r in rows for name in networks_of(one, r)}
         uses = {**filled_weights(sorted(names - set(uses)), out / "rehearsal"), **uses}
         roots = {
-            **_simulated({kind for one, _ in chosen for kind in one.data} - set(roots), out / "rehearsal"),
+            **simulated_data({kind for one, _ in chosen for kind in one.data} - set(roots), out / "rehearsal"),
             **roots,
         }
     failed = _measure(chosen, results, roots, uses, out, device, dry, overwrite, json_)
-    if rehearse and failed:
+    if failed:
         typer.echo(f"error: {len(failed)} rows did not run, first {failed[0]}; the notes say why", err=True)
-        raise typer.Exit(1)
-
-
-def _simulated(kinds: set[str], folder: Path) -> dict[str, Path]:
-    """Folders of simulated frames by kind of dataset; what is there is taken."""
-    from lcf3d.paper.rehearsal import DATA
-    from lcf3d.simulation.writer import Recipe, write_dataset
-
-    for kind in sorted(kinds):
-        write_dataset(Recipe(*DATA[kind]), folder / kind, resume=True)
-    return {kind: folder / kind for kind in sorted(kinds)}
+        # else a row may only wait for a download
+        raise typer.Exit(1 if rehearse else 0)
 
 
 def _measure(
@@ -129,6 +116,7 @@ def _measure(
     from lcf3d.cli.console import print_table
     from lcf3d.files import write_json, write_text
     from lcf3d.paper.report import markdown, table_data, to_json
+    from lcf3d.paper.rows import FAILED, given_results, measured_rows, needed_rows
     from lcf3d.paper.workplace import Workplace
 
     contents = []
@@ -139,8 +127,8 @@ def _measure(
             return lambda: progress.advance(bar)
 
         for one, rows in chosen:
-            place = Workplace(out, roots, uses, _given(one, results), device, overwrite, begin)
-            measured = _needs(one, rows) if dry else _measured(one, rows, place)
+            place = Workplace(out, roots, uses, given_results(one, results or ()), device, overwrite, begin)
+            measured = needed_rows(one, rows) if dry else measured_rows(one, rows, place)
             contents.append(to_json(one, rows, measured))
             data = table_data(one, rows, measured)
             if not dry:
@@ -153,83 +141,6 @@ def _measure(
         typer.echo(json.dumps(contents if len(contents) > 1 else contents[0], indent=2))
     rows_of = [(content["table"], row) for content in contents for row in content["rows"]]
     return [f"{t}: {row['name']}" for t, row in rows_of if any(n.startswith(FAILED) for n in row["notes"])]
-
-
-def _given(table: Table, results: list[str] | None) -> dict[str, Path]:
-    """Result files by name of the row."""
-    from lcf3d.paper.tables import find_row
-
-    found = {}
-    for item in results or ():
-        name, equals, path = item.partition("=")
-        if not equals or not path:
-            raise ConfigError(f"--results takes NAME=DIR, for example LoGoNet=results/logonet, got {item!r}")
-        if table.measure not in ("kitti", "nuscenes"):
-            raise ConfigError(f"{table.name} takes no --results: it needs more than boxes, or boxes of several runs")
-        if not Path(path).expanduser().exists():
-            raise ConfigError(f"--results {item}: there is no {path}")
-        found[find_row(table, name).name] = Path(path).expanduser()
-    return found
-
-
-def _measured(table: Table, rows: tuple[Row, ...], place: Workplace) -> dict[str, Measured]:
-    """All rows, those that cannot be measured with the reason."""
-    from lcf3d.paper.estimates import about
-    from lcf3d.paper.measure import measure_row
-    from lcf3d.paper.networks import NeedsError
-    from lcf3d.paper.workplace import without_values
-
-    if table.measure == "cost":
-        from lcf3d.paper.cost import cost_rows, measure_costs
-
-        try:
-            costs = measure_costs(_fusion_ms, place.uses, place.device)
-        except NeedsError as error:
-            return {row.name: without_values(table, f"needs {error}") for row in rows}
-        return cost_rows(table, rows, costs, place.uses, place.device)
-    measured, absent = {}, []
-    for row in rows:
-        try:
-            measured[row.name] = measure_row(table, row, place)
-        except NeedsError as error:
-            told = row.quoted or row.needs
-            measured[row.name] = without_values(table, *([told] if told else (f"needs {p}" for p in error.parts)))
-            absent += [row] if row.networks else []
-        except ConfigError:
-            raise
-        except Lcf3dError as error:
-            measured[row.name] = without_values(table, f"{FAILED} {error}")
-    for row in absent:
-        # what all of them take together, since a network runs once for all rows
-        measured[row.name] = without_values(table, *measured[row.name].notes, about(table, absent))
-    return measured
-
-
-def _needs(table: Table, rows: tuple[Row, ...]) -> dict[str, Measured]:
-    """What each row would need."""
-    from lcf3d.paper.estimates import DATA, about
-    from lcf3d.paper.workplace import without_values
-
-    found = {}
-    for row in rows:
-        kinds = ((row.task[1],) if row.task else table.data) if row.lidar else ()
-        data = (f"needs --{kind} FOLDER: {DATA[kind]}" for kind in kinds)
-        own = row.quoted or row.needs or f"needs {', '.join(row.networks) or 'no data'}"
-        takes = (about(table, rows) if table.data else "minutes",) if not row.quoted and not row.needs else ()
-        found[row.name] = without_values(table, own, *data, *takes)
-    return found
-
-
-def _fusion_ms() -> dict[str, float]:
-    from lcf3d.benchmark.fusion import bench_fusion
-
-    found = {timing.name: timing.median_ms for timing in bench_fusion(0.5)}
-    names = {
-        "matching": "bounding box matching, 200 x 20",
-        "recovery": "detection recovery, 5 frustums, network",
-        "semantic": "semantic fusion, 40 matches",
-    }
-    return {short: found[name] for short, name in names.items()}
 
 
 def _print_list(json_: bool) -> None:

@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
+from lcf3d.decisions import REAL, WHOLE, Decisions, TrackTable
 from lcf3d.formats.arrow_arrays import lists, measures, numbers, structs, text_lists, texts, words
-from lcf3d.provenance import REAL, WHOLE, Decisions, FusedDetections, TrackTable
+from lcf3d.provenance import FusedDetections
 from lcf3d.reasons import OUTCOMES, REASONS
 from lcf3d.structures import BoolArray, Detections2D, Detections3D, FloatArray
 

@@ -11,9 +11,10 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
+from lcf3d.decisions import REAL, WHOLE, Decisions, TrackTable
 from lcf3d.errors import ConfigError, FormatError
 from lcf3d.files import atomic_path, reading, shortened
-from lcf3d.provenance import REAL, WHOLE, Decisions, FusedDetections, TrackTable
+from lcf3d.provenance import FusedDetections
 from lcf3d.remote.places import fetched
 
 SCHEMA = "1"

@@ -8,10 +8,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lcf3d.decisions import Decisions
 from lcf3d.errors import ConfigError
 from lcf3d.frame import Frame
 from lcf3d.fusion.config import FusionConfig
-from lcf3d.provenance import Decisions
 from lcf3d.reasons import Reason
 from lcf3d.structures import Camera, Detections, Detections2D, Detections3D, IntArray
 

@@ -13,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
+from lcf3d.decisions import TrackTable
 from lcf3d.frame import Frame
 from lcf3d.fusion.evidence import to_log_odds, to_probability
 from lcf3d.fusion.memory import remember
@@ -20,7 +21,7 @@ from lcf3d.fusion.memory_config import MemoryConfig
 from lcf3d.fusion.memory_state import Memory
 from lcf3d.geometry.boxes import wrap_angle
 from lcf3d.geometry.iou import bev_iou
-from lcf3d.provenance import FusedDetections, TrackTable
+from lcf3d.provenance import FusedDetections
 from lcf3d.structures import Detections3D, FloatArray, IntArray
 
 # predicted boxes of both directions that overlap by more than this in the bird's-eye view are one

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lcf3d.decisions import TrackTable
 from lcf3d.fusion.evidence import to_log_odds, to_probability
 from lcf3d.fusion.memory_association import associate
 from lcf3d.fusion.memory_config import MemoryConfig
@@ -35,7 +36,7 @@ from lcf3d.geometry.boxes import transform_boxes
 from lcf3d.geometry.iou import bev_iou
 from lcf3d.geometry.rotation import invert_rigid
 from lcf3d.kernels import kernel
-from lcf3d.provenance import FusedDetections, TrackTable
+from lcf3d.provenance import FusedDetections
 from lcf3d.structures import BoolArray, Detections3D, FloatArray, IntArray
 
 # a predicted box overlaps no detection in the bird's-eye view by more than this

@@ -1,4 +1,4 @@
-"""Weights filled by rule, in place of trained ones, to see that every step of a table runs."""
+"""Weights filled by rule and simulated frames, in place of what is not here, to see that every step of a table runs."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Any
 from lcf3d.detectors.published import find_model
 from lcf3d.files import atomic_path
 from lcf3d.networks.torch import nn, torch
+from lcf3d.simulation.writer import Recipe, write_dataset
 
 # the camera networks are rehearsed as the smallest one that finds the same classes, on small images: file, style, masks
 _CAMERAS = {
@@ -116,3 +117,10 @@ def _lively(network: Any) -> Any:
         if parameter.endswith(("conv_cls", "heatmap.1")) and getattr(module, "bias", None) is not None:
             nn.init.constant_(module.bias, -2.2)
     return network
+
+
+def simulated_data(kinds: set[str], folder: Path) -> dict[str, Path]:
+    """Folders of simulated frames by kind of dataset; what is there is taken."""
+    for kind in sorted(kinds):
+        write_dataset(Recipe(*DATA[kind]), folder / kind, resume=True)
+    return {kind: folder / kind for kind in sorted(kinds)}
