@@ -4,7 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lcf3d.errors import ConfigError, MissingExtraError
-from lcf3d.simulation import all_presets, get_preset, simulate_frame
+from lcf3d.simulation import all_presets, embree, get_preset, simulate_frame
 from lcf3d.simulation.actors import KINDS, KITTI_CLASS, NUSCENES_CLASS, Motion, make_actor
 from lcf3d.simulation.frames import make_stage, simulate_drive
 from lcf3d.simulation.lidar import beam_directions, scan
@@ -114,6 +114,30 @@ def test_rays_meet_a_wall_at_its_distance_and_are_blocked_only_within_reach():
     assert tracer.is_blocked(np.zeros(3), ahead).tolist() == [True]
     assert tracer.is_blocked(np.zeros(3), ahead, 4.0).tolist() == [False]
     assert tracer.is_blocked(np.zeros(3), np.zeros((0, 3))).shape == (0,)
+
+
+@pytest.mark.parametrize("count", [1, 300])
+def test_embree_itself_and_embreex_give_the_same_bits(count, monkeypatch):
+    rng = np.random.default_rng(count)
+    soup = (rng.normal(0, 20, (count, 1, 3)) + rng.normal(0, 3, (count, 3, 3))).astype(np.float32)
+    direction = rng.normal(size=(4000, 3)).astype(np.float32)
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    origins = rng.normal(0, 5, (4000, 3)).astype(np.float32)
+    assert embree.library() is not None
+    ours = RayTracer(soup)
+    monkeypatch.setattr(embree, "library", lambda: None)
+    theirs = RayTracer(soup)
+    assert type(ours._tree) is not type(theirs._tree)
+    for origin in (origins, origins[0]):
+        a, b = (tracer.first_hits(origin, direction) for tracer in (ours, theirs))
+        assert count == 1 or 0.1 < (a.triangle >= 0).mean() < 1
+        for name in ("triangle", "distance", "u", "v"):
+            np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
+        for reach in (10.0, 1e4):
+            blocked = ours.is_blocked(origin, direction, reach)
+            np.testing.assert_array_equal(blocked, theirs.is_blocked(origin, direction, reach))
+            # the same question answered by distances
+            np.testing.assert_array_equal(blocked, (a.triangle >= 0) & (a.distance <= reach))
 
 
 def test_a_scan_has_the_beams_of_its_table():

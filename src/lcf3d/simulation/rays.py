@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
@@ -41,35 +42,57 @@ class RayTracer:
     """
 
     def __init__(self, corners: NDArray[np.floating]) -> None:
-        try:
-            from embreex.mesh_construction import TriangleMesh
-            from embreex.rtcore_scene import EmbreeScene
-        except ImportError:
-            raise MissingExtraError("embreex", "simulate", "ray casting") from None
-        self._scene: Any = EmbreeScene()
-        self._mesh = TriangleMesh(self._scene, np.ascontiguousarray(corners, dtype=np.float32))
-        # the first query builds the search tree, which must not happen in two threads at once
-        self.first_hits(np.zeros(3), np.array([[0, 0, 1.0]]))
+        if find_spec("embreex") is None:
+            raise MissingExtraError("embreex", "simulate", "ray casting")
+        from lcf3d.simulation.embree import Tree, library
+
+        tree = Tree if library() is not None else _EmbreexTree
+        self._tree: Any = tree(np.ascontiguousarray(corners, dtype=np.float32))
 
     def first_hits(self, origins: NDArray[np.floating], directions: NDArray[np.floating]) -> Hits:
         """First hits from (N, 3) or one common (3,) origin along (N, 3) unit directions."""
-        o, d = _rays(origins, directions)
-        found = self._scene.run(o, d, query="INTERSECT", output=1)
-        return Hits(found["primID"], found["tfar"], found["u"], found["v"])
+        return Hits(*self._tree.first_hits(*_rays(origins, directions)))
 
     def is_blocked(
         self, origins: NDArray[np.floating], directions: NDArray[np.floating], reach_m: float = 1e4
     ) -> NDArray[np.bool_]:
         """(N,) whether anything lies within ``reach_m`` along the rays."""
         o, d = _rays(origins, directions)
-        if not len(o):
+        if not len(d):
             return np.zeros(0, dtype=bool)
-        limits = np.full(len(o), reach_m, dtype=np.float32)
-        blocked: NDArray[np.bool_] = self._scene.run(o, d, limits, query="OCCLUDED") == 0
+        blocked: NDArray[np.bool_] = self._tree.is_blocked(o, d, reach_m)
+        return blocked
+
+
+class _EmbreexTree:
+    """`lcf3d.simulation.embree.Tree` by embreex, where its library is not found: slower to build, the same results."""
+
+    def __init__(self, corners: Floats) -> None:
+        from embreex.mesh_construction import TriangleMesh
+        from embreex.rtcore_scene import EmbreeScene
+
+        self._scene: Any = EmbreeScene()
+        self._mesh = TriangleMesh(self._scene, corners)
+        # the first query builds the search tree, which must not happen in two threads at once
+        self.first_hits(np.zeros((1, 3), np.float32), np.array([[0, 0, 1]], np.float32))
+
+    def first_hits(self, origins: Floats, directions: Floats) -> tuple[NDArray[np.int32], Floats, Floats, Floats]:
+        found = self._scene.run(_each(origins, directions), directions, query="INTERSECT", output=1)
+        return found["primID"], found["tfar"], found["u"], found["v"]
+
+    def is_blocked(self, origins: Floats, directions: Floats, reach_m: float) -> NDArray[np.bool_]:
+        limits = np.full(len(directions), reach_m, dtype=np.float32)
+        blocked: NDArray[np.bool_] = (
+            self._scene.run(_each(origins, directions), directions, limits, query="OCCLUDED") == 0
+        )
         return blocked
 
 
 def _rays(origins: NDArray[np.floating], directions: NDArray[np.floating]) -> tuple[Floats, Floats]:
-    d = np.ascontiguousarray(directions, dtype=np.float32)
-    o = np.ascontiguousarray(np.broadcast_to(np.asarray(origins, dtype=np.float32), d.shape))
-    return o, d
+    """(1, 3) or (N, 3) origins and (N, 3) directions as they are traced."""
+    origins = np.ascontiguousarray(origins, dtype=np.float32).reshape(-1, 3)
+    return origins, np.ascontiguousarray(directions, dtype=np.float32)
+
+
+def _each(origins: Floats, directions: Floats) -> Floats:
+    return np.ascontiguousarray(np.broadcast_to(origins, directions.shape))
