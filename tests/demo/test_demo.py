@@ -1,4 +1,5 @@
 import json
+import time
 
 import numpy as np
 import pytest
@@ -6,9 +7,20 @@ from typer.testing import CliRunner
 
 from lcf3d.cli.app import app
 from lcf3d.datasets.drive import beam_numbers, every_beam, read_drive
-from lcf3d.demo.drive import FULL, LIDAR_ALONE, LIDARS, VARIANTS, drive, ground_truth, measure, shipped_detectors
+from lcf3d.demo.drive import (
+    FULL,
+    LIDAR_ALONE,
+    LIDARS,
+    VARIANTS,
+    Detectors,
+    drive,
+    ground_truth,
+    measure,
+    shipped_detectors,
+)
 from lcf3d.geometry.boxes import points_in_boxes
 from lcf3d.reasons import Outcome
+from lcf3d.structures import KITTI_CLASSES, Detections2D, Detections3D
 
 
 @pytest.fixture(scope="module")
@@ -45,6 +57,31 @@ def test_both_networks_find_things_and_every_stage_takes_part(driven, lidar):
     # the dense LiDAR's network need not miss anything in these frames
     assert Outcome.RECOVERED in outcomes or lidar == "64 beams"
     assert all(set(item.milliseconds) == set(driven[lidar][0].milliseconds) for item in driven[lidar])
+
+
+def test_networks_begin_with_the_next_frame_while_this_one_is_fused():
+    started, ended = [], []
+
+    class Slow:
+        def __init__(self, name, result):
+            self.name, self.result = name, result
+
+        def __call__(self, values):
+            started.append((self.name, time.perf_counter()))
+            time.sleep(0.05)
+            ended.append((self.name, time.perf_counter()))
+            return self.result
+
+    nothing = Detections3D.empty(KITTI_CLASSES), [Detections2D.empty(KITTI_CLASSES)]
+    moments = drive(Detectors(Slow("lidar", nothing[0]), Slow("camera", nothing[1])), 3)
+    next(moments)
+    time.sleep(0.05)  # somebody looks at the first moment; the first frame of the second is under way
+    begun = len(started)
+    rest = list(moments)
+    # one frame to warm up, two of the first moment, one ahead; two networks each
+    assert begun == 2 * 4
+    assert len(started) == len(ended) == 2 * 7
+    assert [sum(item.milliseconds["frame"] > 0 for item in moment.values()) for moment in rest] == [2, 2]
 
 
 def test_both_lidars_see_the_same_moment(driven):

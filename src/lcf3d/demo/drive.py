@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
+from itertools import islice
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -64,7 +66,7 @@ class DemoFrame:
         lidar: 3D detections without non-maximum suppression.
         camera: 2D detections by camera name.
         fused: of the full fusion.
-        milliseconds: ``LiDAR network``, ``camera network``, ``both at once``, ``fusion``, ``frame``.
+        milliseconds: ``LiDAR network``, ``camera network``, ``fusion``; ``frame`` since the frame before was done.
     """
 
     frame: Frame
@@ -82,7 +84,7 @@ class DemoResult:
         frames: the frames of the drive.
         metrics: by variant, `LIDAR_ALONE` first.
         fusion_ms: median milliseconds of the fusion by variant.
-        stage_ms: median milliseconds by stage, see `DemoFrame`.
+        stage_ms: median milliseconds by stage, of ``frame`` the mean, see `DemoFrame`.
     """
 
     frames: list[DemoFrame]
@@ -138,36 +140,61 @@ def _frame(item: ShippedFrame, number: int, beam_step: int) -> Frame:
 
 
 def drive(detectors: Detectors, count: int = FRAMES) -> Iterator[dict[str, DemoFrame]]:
-    """The first ``count`` moments of the shipped drive: both networks at the same time, then the fusion, by `LIDARS`.
+    """The first ``count`` moments of the shipped drive, by `LIDARS`: both networks, then the fusion.
+
+    The networks have a thread each, and begin with the next frame while this one is fused.
 
     Raises:
         FormatError: the shipped archive is damaged.
     """
     shipped = read_drive(count=count)
     fusion = LateCascadeFusion(FusionConfig.preset("kitti"), ShippedLocalizer())
+    moments = [[_frame(item, i, step) for step in LIDARS.values()] for i, item in enumerate(shipped)]
     with ThreadPoolExecutor(2) as pool:
         # compiles or loads what it needs
-        _look(detectors, fusion, _frame(shipped[0], 0, 1), pool)
-        for i, item in enumerate(shipped):
-            yield {name: _look(detectors, fusion, _frame(item, i, step), pool) for name, step in LIDARS.items()}
+        _finished(_begun(moments[0][0], detectors, pool), fusion, 0.0)
+        begun = _one_ahead(_begun(frame, detectors, pool) for moment in moments for frame in moment)
+        last = time.perf_counter()
+        for _ in moments:
+            seen = {}
+            for name in LIDARS:
+                seen[name], last = _finished(next(begun), fusion, last)
+            yield seen
 
 
-def _look(detectors: Detectors, fusion: LateCascadeFusion, frame: Frame, pool: ThreadPoolExecutor) -> DemoFrame:
-    """One moment through both networks in parallel threads, and the fusion."""
-    points, ((name, image),) = frame.points, frame.images.items()
+class _Begun(NamedTuple):
+    """A frame that both networks are at work on; each gives what it finds and the milliseconds it took."""
+
+    frame: Frame
+    lidar: Future[tuple[Detections3D, float]]
+    camera: Future[tuple[Detections2D, float]]
+
+
+def _begun(frame: Frame, detectors: Detectors, pool: ThreadPoolExecutor) -> _Begun:
+    points, (image,) = frame.points, frame.images.values()
     assert points is not None
-    started = time.perf_counter()
     lidar = pool.submit(_timed, lambda: detectors.lidar(points))
-    camera = pool.submit(_timed, lambda: detectors.camera([image])[0])
-    (boxes, lidar_ms), (found, camera_ms) = lidar.result(), camera.result()
-    spent = {
-        "LiDAR network": lidar_ms,
-        "camera network": camera_ms,
-        "both at once": (time.perf_counter() - started) * 1e3,
-    }
-    fused, spent["fusion"] = _timed(partial(fusion, frame, boxes, {name: found}))
-    spent["frame"] = (time.perf_counter() - started) * 1e3
-    return DemoFrame(frame, boxes, {name: found}, fused, spent)
+    return _Begun(frame, lidar, pool.submit(_timed, lambda: detectors.camera([image])[0]))
+
+
+def _one_ahead(items: Iterable[T]) -> Iterator[T]:
+    """The items, each handed out after the next one was made."""
+    rest = iter(items)
+    waiting = deque(islice(rest, 1))
+    while waiting:
+        waiting.extend(islice(rest, 1))
+        yield waiting.popleft()
+
+
+def _finished(begun: _Begun, fusion: LateCascadeFusion, last: float) -> tuple[DemoFrame, float]:
+    """A frame fused, and when that was; ``last`` is when the frame before was."""
+    frame = begun.frame
+    (boxes, lidar_ms), (found, camera_ms) = begun.lidar.result(), begun.camera.result()
+    camera = dict.fromkeys(frame.images, found)
+    fused, fusion_ms = _timed(partial(fusion, frame, boxes, camera))
+    now = time.perf_counter()
+    spent = {"LiDAR network": lidar_ms, "camera network": camera_ms, "fusion": fusion_ms, "frame": (now - last) * 1e3}
+    return DemoFrame(frame, boxes, camera, fused, spent), now
 
 
 def _timed(call: Callable[[], T]) -> tuple[T, float]:
@@ -199,8 +226,10 @@ def measure(frames: list[DemoFrame]) -> DemoResult:
     metrics = {
         name: evaluate_generalization([t for t in truth if t is not None], results) for name, results in found.items()
     }
-    outcomes = {name: float(np.median([f.milliseconds[name] for f in frames])) for name in frames[0].milliseconds}
-    return DemoResult(frames, metrics, milliseconds, outcomes)
+    stages = {name: float(np.median([f.milliseconds[name] for f in frames])) for name in frames[0].milliseconds}
+    # two frames are under way at once: what passes between their ends is short and long in turn
+    stages["frame"] = float(np.mean([f.milliseconds["frame"] for f in frames]))
+    return DemoResult(frames, metrics, milliseconds, stages)
 
 
 def write_pictures(frames: Sequence[DemoFrame], folder: Path) -> list[Path]:
