@@ -14,7 +14,7 @@ from lcf3d.fusion.alignment import Alignment, realigned
 from lcf3d.fusion.alignment_matching import Sighting
 from lcf3d.fusion.alignment_watch import CORRELATED, FEWEST_PAIRS, CameraReport, WatchSettings, estimate, judge
 from lcf3d.provenance import FusedDetections
-from lcf3d.run.sources import CameraOnImages
+from lcf3d.run.sources import in_files
 from lcf3d.structures import Detections2D, Detections3D
 
 # frames that are looked at, evenly over the drive; the same where a camera detector has to be run on them
@@ -64,8 +64,7 @@ def looked_at(frame_ids: Sequence[str], cameras: Mapping[str, CameraSource]) -> 
 
 
 def _looked_at(frame_ids: Sequence[str], cameras: Mapping[str, CameraSource]) -> tuple[Sequence[str], int]:
-    most = FRAMES_WITH_IMAGES if any(isinstance(source, CameraOnImages) for source in cameras.values()) else FRAMES
-    return _evenly(frame_ids, most)
+    return evenly(frame_ids, FRAMES if in_files(cameras) else FRAMES_WITH_IMAGES)
 
 
 def turned_warnings(
@@ -81,7 +80,7 @@ def turned_warnings(
         read: gives the result of a frame.
         class_names: classes that both branches detect.
     """
-    chosen, step = _evenly(frame_ids, LOOKED_BACK)
+    chosen, step = evenly(frame_ids, LOOKED_BACK)
 
     def detections(frame: Frame) -> tuple[Detections3D, dict[str, Detections2D]]:
         fused = read(frame.id)
@@ -98,7 +97,7 @@ def turned_warnings(
     return tuple(warnings)
 
 
-def _evenly(frame_ids: Sequence[str], most: int) -> tuple[Sequence[str], int]:
+def evenly(frame_ids: Sequence[str], most: int) -> tuple[Sequence[str], int]:
     """At most so many frames, evenly, and the step from one to the next."""
     step = -(-len(frame_ids) // most) or 1
     return frame_ids[::step], step

@@ -140,3 +140,8 @@ def _warn_once(sensor: str, name: str) -> None:
 def real_data_note(card: str) -> str:
     """The line of a model card that begins with `ON_REAL_DATA`; empty if there is none."""
     return next((line.strip() for line in card.splitlines() if line.startswith(ON_REAL_DATA)), "")
+
+
+def in_files(cameras: Mapping[str, CameraSource]) -> bool:
+    """Whether the detections of all cameras are there already: no detector has to be run on images."""
+    return not any(isinstance(source, CameraOnImages) for source in cameras.values())

@@ -16,9 +16,9 @@ from lcf3d.fusion.alignment import Alignment
 from lcf3d.fusion.calibration import Calibration, load_calibration
 from lcf3d.fusion.config import FusionConfig
 from lcf3d.fusion.self_calibration import self_calibrate
-from lcf3d.run.alignment import aligned_frame
+from lcf3d.run.alignment import aligned_frame, evenly
 from lcf3d.run.joins import FEW_FRAMES
-from lcf3d.run.sources import CameraOnImages, DetectorOnFrames, LidarOnScans
+from lcf3d.run.sources import DetectorOnFrames, LidarOnScans, in_files
 from lcf3d.structures import Detections2D
 
 log = logging.getLogger(__name__)
@@ -33,18 +33,14 @@ Looked = list[tuple[Frame, dict[str, Detections2D]]]
 
 def teaching_frames(frame_ids: Sequence[str]) -> Sequence[str]:
     """The sample of a run's frames: at most `TEACHING_FRAMES`."""
-    return _evenly(frame_ids, TEACHING_FRAMES)
-
-
-def _evenly(frame_ids: Sequence[str], most: int) -> Sequence[str]:
-    return frame_ids[:: -(-len(frame_ids) // most) or 1]
+    return evenly(frame_ids, TEACHING_FRAMES)[0]
 
 
 def look(dataset: Dataset, frame_ids: Sequence[str], cameras: Mapping[str, CameraSource]) -> Looked:
     """The sample of some frames, and what the cameras that can be looked through detect in each."""
     chosen = teaching_frames(frame_ids)
-    if not _in_files(cameras):
-        chosen = _evenly(chosen, TEACHING_IMAGES)
+    if not in_files(cameras):
+        chosen = evenly(chosen, TEACHING_IMAGES)[0]
     looked = []
     for frame in map(dataset.frame, chosen):
         there = [c.name for c in frame.cameras if c.name in cameras and cameras[c.name].sees(frame, c.name)]
@@ -54,7 +50,7 @@ def look(dataset: Dataset, frame_ids: Sequence[str], cameras: Mapping[str, Camer
 
 def look_in_files(dataset: Dataset, frame_ids: Sequence[str], cameras: Mapping[str, CameraSource]) -> Looked:
     """As `look` where all detections are in files; nothing else, for what a detector can report it says itself."""
-    return look(dataset, frame_ids, cameras) if _in_files(cameras) else []
+    return look(dataset, frame_ids, cameras) if in_files(cameras) else []
 
 
 def reported_classes(
@@ -114,7 +110,7 @@ def find_calibration(
     low, high = (min((float(s.min()) for s in scores), default=0.0), max((float(s.max()) for s in scores), default=0.0))
     probabilities = low >= 0 and high <= 1
     # probabilities need no map, but evidence also asks which classes the camera knows, which files tell at no cost
-    if probabilities and not (config.ensemble == "evidence" and _in_files(cameras) and len(frame_ids) >= FEW_FRAMES):
+    if probabilities and not (config.ensemble == "evidence" and in_files(cameras) and len(frame_ids) >= FEW_FRAMES):
         return None
     looked = looked or look(dataset, frame_ids, cameras)
     if not probabilities:
@@ -130,8 +126,3 @@ def find_calibration(
     if len(looked) < FEW_FRAMES:
         calibration = calibration.model_copy(update={"camera_classes": None})
     return calibration
-
-
-def _in_files(cameras: Mapping[str, CameraSource]) -> bool:
-    """Whether no camera detector has to be run."""
-    return all(not isinstance(source, CameraOnImages) for source in cameras.values())

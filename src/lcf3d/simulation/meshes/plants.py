@@ -27,9 +27,7 @@ def leaf_cloud(
     lump = 1.0 + 0.22 * np.sin(direction @ rng.normal(size=(3, 4)) * 4.0 + rng.uniform(0, 6, 4)).mean(axis=1)
     depth = rng.random(count) ** 0.45 * lump
     at = centre + direction * depth[:, None] * radii
-    spread = rng.normal(size=(count, 3, 3))
-    spread -= spread.mean(axis=1, keepdims=True)
-    spread *= size / np.linalg.norm(spread, axis=2, keepdims=True)
+    spread = _corners(count, size, rng)
     normals = direction / radii + rng.normal(scale=0.25, size=(count, 3)) / radii.mean()
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     mesh = make_mesh(
@@ -119,23 +117,9 @@ def hedge(length: float, height: float, colour: Colour, rng: np.random.Generator
     normals = np.where((face == 1)[:, None], [0, 0.3, 1.0], p * [0, 2.0, 0] + [0, 0, 0.3])
     normals = normals + rng.normal(scale=0.35, size=(count, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    spread = rng.normal(size=(count, 3, 3))
-    spread -= spread.mean(axis=1, keepdims=True)
-    spread *= 0.065 / np.linalg.norm(spread, axis=2, keepdims=True)
-    mesh = make_mesh(
-        at[:, None] + spread,
-        "leaves",
-        colour,
-        uv=np.zeros((count, 3, 2)),
-        normals=np.repeat(normals[:, None], 3, axis=1),
-    )
+    spread = _corners(count, 0.065, rng)
     shade = rng.uniform(0.6, 1.35, (count, 1))
-    return Mesh.join(
-        [
-            core,
-            replace(mesh, colour=(mesh.colour * shade).astype(np.float32), seed=rng.random(count).astype(np.float32)),
-        ]
-    )
+    return Mesh.join([core, _leaves(at[:, None] + spread, normals, colour, shade, rng)])
 
 
 def undergrowth(
@@ -145,17 +129,31 @@ def undergrowth(
     at = rng.random((count, 3)) * [length, depth, 1] - [length / 2, 0, 0]
     ceiling = height * (0.35 + 0.65 * np.abs(np.sin(at[:, 0] * 0.9 + np.sin(at[:, 1] * 1.7) * 2)))
     at[:, 2] = rng.random(count) ** 0.7 * ceiling
-    spread = rng.normal(size=(count, 3, 3))
-    spread -= spread.mean(axis=1, keepdims=True)
-    spread *= leaf / np.linalg.norm(spread, axis=2, keepdims=True)
+    spread = _corners(count, leaf, rng)
     normals = rng.normal(scale=0.4, size=(count, 3)) + [0, -0.5, 0.8]
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    mesh = make_mesh(
-        at[:, None] + spread,
-        "leaves",
-        colour,
-        uv=np.zeros((count, 3, 2)),
-        normals=np.repeat(normals[:, None], 3, axis=1),
-    )
     shade = (0.3 + 0.8 * at[:, 2:] / height) * rng.uniform(0.7, 1.3, (count, 1))
+    return _leaves(at[:, None] + spread, normals, colour, shade, rng)
+
+
+def _corners(count: int, size: float, rng: np.random.Generator) -> NDArray[np.float64]:
+    """(count, 3, 3) corners of triangles about the origin, each ``size`` away from their middle."""
+    spread = rng.normal(size=(count, 3, 3))
+    spread -= spread.mean(axis=1, keepdims=True)
+    spread *= size / np.linalg.norm(spread, axis=2, keepdims=True)
+    return spread
+
+
+def _leaves(
+    triangles: NDArray[np.float64],
+    normals: NDArray[np.float64],
+    colour: Colour,
+    shade: NDArray[np.float64],
+    rng: np.random.Generator,
+) -> Mesh:
+    """A mesh of (N, 3, 3) leaves, each with one of (N, 3) normals and (N, 1) shades of a colour."""
+    count = len(triangles)
+    mesh = make_mesh(
+        triangles, "leaves", colour, uv=np.zeros((count, 3, 2)), normals=np.repeat(normals[:, None], 3, axis=1)
+    )
     return replace(mesh, colour=(mesh.colour * shade).astype(np.float32), seed=rng.random(count).astype(np.float32))
