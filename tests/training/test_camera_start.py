@@ -10,6 +10,7 @@ import pytest
 torch = pytest.importorskip("torch")
 pytest.importorskip("onnx")
 
+from lcf3d.datasets.drive import read_drive  # noqa: E402
 from lcf3d.detectors.camera.small import shipped_path  # noqa: E402
 from lcf3d.detectors.camera.small_export import export_small  # noqa: E402
 from lcf3d.detectors.camera.small_network import SmallConfig  # noqa: E402
@@ -32,13 +33,21 @@ def task(prototypes: int = 16, begin: Path | None = None, classes: int = 3) -> C
     return CameraTask(IMAGES, (), config, batch_size=4, view=(96, 128), begin=begin)
 
 
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The shipped network as a file without layers of bytes."""
+    path = tmp_path_factory.mktemp("plain") / "camera.onnx"
+    export_small(task(begin=shipped_path("kitti")).network(), path)
+    return path
+
+
 @pytest.mark.parametrize("prototypes", [16, 0])
-def test_a_training_begins_where_the_shipped_network_stands(prototypes: int) -> None:
-    begun = task(prototypes, shipped_path("kitti"))
+def test_a_training_begins_where_the_exported_network_stands(prototypes: int, plain: Path) -> None:
+    begun = task(prototypes, plain)
     network = begun.network()
     assert network.training
     image = np.random.default_rng(1).random((1, 3, 96, 160), dtype=np.float32)
-    exported = open_session(shipped_path("kitti"), 1, "").run(None, {"images": image})
+    exported = open_session(plain, 1, "").run(None, {"images": image})
     with torch.no_grad():
         outputs = network.eval()(torch.from_numpy(image))
     table = outputs[0] if prototypes else outputs
@@ -49,6 +58,18 @@ def test_a_training_begins_where_the_shipped_network_stands(prototypes: int) -> 
     if prototypes:
         np.testing.assert_allclose(table[:, 7:], exported[0][:, 7:], rtol=1e-3, atol=1e-3)
         np.testing.assert_allclose(outputs[1], exported[1], rtol=1e-3, atol=1e-3)
+
+
+def test_bytes_of_the_shipped_network_become_weights_again() -> None:
+    image = read_drive(count=1)[0].image[:352, :1216].transpose(2, 0, 1)[None] / np.float32(255)
+    exported = open_session(shipped_path("kitti"), 1, "").run(None, {"images": image})
+    with torch.no_grad():
+        table, prototypes = task(begin=shipped_path("kitti")).network().eval()(torch.from_numpy(image))
+    # the file rounds its maps as well, so that the two are alike and not equal
+    assert np.corrcoef(table[0, 4:7].flatten(), exported[0][0, 4:7].ravel())[0, 1] > 0.95
+    assert np.corrcoef(prototypes.flatten(), exported[1].ravel())[0, 1] > 0.99
+    best = np.argsort(-exported[0][0, 4:7].max(axis=0))[:60]
+    assert np.median(np.abs(table.numpy()[0, :4, best] - exported[0][0, :4, best])) < 2
 
 
 def test_in_training_it_knows_what_the_shipped_network_knows() -> None:

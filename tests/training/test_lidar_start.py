@@ -11,6 +11,7 @@ torch = pytest.importorskip("torch")
 pytest.importorskip("onnx")
 pytest.importorskip("tensorboard")
 
+from lcf3d.datasets.drive import read_drive  # noqa: E402
 from lcf3d.detectors.fusion.frustum_pillars import frustum_pillars  # noqa: E402
 from lcf3d.detectors.fusion.painting import painted  # noqa: E402
 from lcf3d.detectors.lidar import OnnxLidarDetector, export_onnx  # noqa: E402
@@ -30,23 +31,36 @@ def painted_scene(number):
     return LabelledScan(np.concatenate([scan.points, paint], axis=1), scan.boxes, scan.labels, scan.counts)
 
 
-def test_a_painted_training_begins_where_the_exported_network_stands():
+def test_a_painted_training_begins_where_the_exported_network_stands(tmp_path):
+    plain = tmp_path / "lidar.onnx"
+    learned = LidarTask(SCENES, None, COMPACT_KITTI, batch_size=2, window=(64, 64), begin=shipped_path("kitti"))
+    export_onnx(trained_detector(learned.network(), COMPACT_KITTI), plain)
     config = painted_config("masks:shipped:kitti")
-    task = LidarTask(
-        ScanSource(painted_scene, 6, np.pi), None, config, batch_size=2, window=(64, 64), begin=shipped_path("kitti")
-    )
+    task = LidarTask(ScanSource(painted_scene, 6, np.pi), None, config, batch_size=2, window=(64, 64), begin=plain)
     network = task.network()
     assert network.training
     detector = trained_detector(network, config, score_threshold=0.01)
     scan = painted_scene(0)
     found = detector(scan.points)
-    exported = OnnxLidarDetector(shipped_path("kitti"), nms="keep", score_threshold=0.01, threads=1)(scene(0).points)
+    exported = OnnxLidarDetector(plain, nms="keep", score_threshold=0.01, threads=1)(scene(0).points)
     assert len(found) == len(exported) > 0
     np.testing.assert_allclose(found.scores, exported.scores, atol=1e-4)
     np.testing.assert_allclose(found.boxes, exported.boxes, atol=1e-3)
     # what the points are painted with is learned from the first step
     sum(task.loss(network, task.batch(0, np.random.default_rng(0))).values()).backward()
     assert network.voxel_encoder.layers[0].linear.weight.grad[:, 39:].abs().sum() > 0
+
+
+def test_bytes_of_the_shipped_network_become_weights_again():
+    task = LidarTask(SCENES, None, COMPACT_KITTI, batch_size=2, window=(64, 64), begin=shipped_path("kitti"))
+    points = read_drive(count=1)[0].points
+    found = trained_detector(task.network(), COMPACT_KITTI, score_threshold=0.3)(points)
+    exported = OnnxLidarDetector(shipped_path("kitti"), nms="keep", score_threshold=0.3, threads=1)(points)
+    # the file rounds its maps as well, so that the two are alike and not equal
+    assert len(exported) > 5
+    assert abs(len(found) - len(exported)) <= 2
+    apart = np.linalg.norm(found.boxes[:, None, :3] - exported.boxes[None, :, :3], axis=2).min(axis=1)
+    assert np.median(apart) < 0.1
 
 
 def test_what_is_no_compact_network_is_refused(tmp_path):

@@ -8,6 +8,7 @@ from lcf3d.cli.train_camera import camera
 from lcf3d.cli.train_clocs import clocs
 from lcf3d.cli.train_lidar import lidar
 from lcf3d.cli.train_localizer import localizer
+from lcf3d.cli.train_quantize import quantize
 
 train = typer.Typer(
     name="train",
@@ -15,5 +16,5 @@ train = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )
-for verb in (localizer, lidar, camera, clocs):
+for verb in (localizer, lidar, camera, clocs, quantize):
     train.command(verb.__name__)(verb)

@@ -7,7 +7,7 @@ close to where the exported network stood.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ from lcf3d.errors import DetectorError, MissingExtraError
 
 
 def exported_graph(path: Path) -> tuple[Any, dict[str, NDArray[np.float32]]]:
-    """The graph of an ONNX file, and its parameters by name.
+    """The graph of an ONNX file, and its parameters by name; those that are stored as bytes by their own name again.
 
     Raises:
         DetectorError: the file is absent or no ONNX file.
@@ -34,9 +34,23 @@ def exported_graph(path: Path) -> tuple[Any, dict[str, NDArray[np.float32]]]:
         raise DetectorError(f"{path} does not exist; expected an exported network, or shipped:kitti")
     try:
         graph = onnx.load(str(path)).graph
-        return graph, {tensor.name: to_array(tensor) for tensor in graph.initializer}
+        values = {tensor.name: to_array(tensor) for tensor in graph.initializer}
+        return graph, values | dict(_dequantized(graph, values))
     except Exception as error:  # protobuf's errors share no base class with onnx's
         raise DetectorError(f"{path} cannot be read as an ONNX file ({type(error).__name__})") from None
+
+
+def _dequantized(graph: Any, values: Mapping[str, NDArray[Any]]) -> Iterator[tuple[str, NDArray[np.float32]]]:
+    """Parameters that are stored as bytes (`lcf3d.training.quantization`), by their own names and their nodes'."""
+    for node in graph.node:
+        if node.op_type != "DequantizeLinear" or node.input[0] not in values:
+            continue
+        stored, scale, zero = (values[name].astype(np.float32) for name in node.input)
+        # one scale, or one a channel of the first axis
+        shape = (-1,) + (1,) * (stored.ndim - 1) if scale.size > 1 else ()
+        whole = ((stored - zero.reshape(shape)) * scale.reshape(shape)).astype(np.float32)
+        yield node.output[0], whole
+        yield node.input[0].removesuffix("_quantized"), whole
 
 
 def begin_folded(

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lcf3d.detectors.base import Image
-from lcf3d.detectors.camera.onnx_images import instance_masks, prepare_image
+from lcf3d.detectors.camera.onnx_images import Placement, instance_masks, prepare_image
 from lcf3d.detectors.camera.onnx_layouts import LAYOUTS, SIZES_INPUT, class_count, identify_layout, tell_by_values
 from lcf3d.detectors.camera.tiling import merge_tiles, non_maximum_suppression, tile_spans
 from lcf3d.detectors.classes import COCO_CLASSES, read_class_names, reported_classes, to_classes
@@ -130,9 +130,16 @@ class OnnxDetector:
         mapped = to_classes(found, self.class_names, self._mapping)
         return mapped[np.argsort(-mapped.scores, kind="stable")]
 
+    def inputs(self, image: Image) -> dict[str, NDArray[Any]]:
+        """What the network is given for an (H, W, 3) uint8 RGB image, by the names of its inputs."""
+        return self._inputs(self._prepared(image)[0])
+
+    def _prepared(self, image: Image) -> tuple[NDArray[np.float32], Placement]:
+        return prepare_image(image, self._size, self._layout, self._imagenet)
+
     def _forward(self, image: Image) -> Detections2D:
         """One pass over one image or tile, in the network's own classes."""
-        values, placement = prepare_image(image, self._size, self._layout, self._imagenet)
+        values, placement = self._prepared(image)
         outputs = self._run(values)
         try:
             raw = self._layout.decode(outputs, self._size, self._score_threshold)
@@ -156,14 +163,17 @@ class OnnxDetector:
         scores = np.clip(raw.scores[kept], 0, 1)
         return Detections2D(boxes[kept], scores, labels, self.own_class_names, masks)
 
-    def _run(self, values: NDArray[np.float32]) -> list[NDArray[Any]]:
-        """The chosen outputs for one prepared input."""
+    def _inputs(self, values: NDArray[np.float32]) -> dict[str, NDArray[Any]]:
         inputs: dict[str, NDArray[Any]] = {self._image_name: values.astype(self._dtype, copy=False)}
         if SIZES_INPUT in self._input_names():
             # width before height; naming the input's own size keeps the boxes in its pixels
             inputs[SIZES_INPUT] = np.array([[self._size[1], self._size[0]]], dtype=np.int64)
+        return inputs
+
+    def _run(self, values: NDArray[np.float32]) -> list[NDArray[Any]]:
+        """The chosen outputs for one prepared input."""
         try:
-            return list(self._session.run(self._outputs, inputs))
+            return list(self._session.run(self._outputs, self._inputs(values)))
         except Exception as error:  # onnxruntime's exceptions share no base class
             raise DetectorError(f"{self.path} cannot be run on an image: {first_line(error)}") from error
 

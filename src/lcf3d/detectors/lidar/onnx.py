@@ -87,6 +87,10 @@ class OnnxLidarDetector:
         found = map_detections(self.maps(inputs), self.config, self.score_threshold, self.nms)
         return checked(grounded(found, ground, self.config), points, self.config, self.score_threshold)
 
+    def inputs(self, points: NDArray[np.floating]) -> dict[str, NDArray[Any]] | None:
+        """What the network is given for (N, 4 or more) points, by the names of its inputs; None if it sees none."""
+        return encoder_inputs(levelled(points, ground_of(points, self.config), self.config), self.config)
+
     def maps(self, inputs: dict[str, NDArray[Any]]) -> list[Any]:
         """The head's maps, without batch axis, from the arrays of `encoder_inputs`."""
         names = [output.name for output in self._session.get_outputs()]
