@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lcf3d.simulation.materials import MATERIAL_ID
+from lcf3d.simulation.meshes.grids import grid_triangles
 
 Floats = NDArray[np.float32]
 
@@ -189,7 +190,10 @@ def grid(
     uv: NDArray[np.floating] | None = None,
     seed: float = 0.0,
 ) -> Mesh:
-    """The surface through (R, C, 3) points; ``closed`` joins the last column to the first."""
+    """The surface through (R, C, 3) points; ``closed`` joins the last column to the first.
+
+    ``crease`` is the cosine of the largest angle between a face and the averaged normal that is still smooth.
+    """
     p = np.asarray(points, dtype=np.float64)
     if closed:
         p = np.concatenate([p, p[:, :1]], axis=1)
@@ -197,38 +201,8 @@ def grid(
         along = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(p, axis=0), axis=2).mean(axis=1))])
         around = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(p, axis=1), axis=2).mean(axis=0))])
         uv = np.stack(np.meshgrid(around, along), axis=-1)
-    normals = _grid_normals(p, closed, crease)
-    return make_mesh(grid_triangles(p), material, colour, grid_triangles(uv), normals, seed)
-
-
-def _grid_normals(p: NDArray[np.float64], closed: bool, crease: float) -> NDArray[np.float64]:
-    """(T, 3, 3) corner normals of a grid, averaged over touching triangles unless they bend more than the crease.
-
-    ``crease`` is the cosine of the largest angle between a face and the averaged normal that is still smooth.
-    """
-    a, b, c, d = p[:-1, :-1], p[:-1, 1:], p[1:, 1:], p[1:, :-1]
-    first, second = cross(b - a, c - a), cross(c - a, d - a)
-    vertex = np.zeros_like(p)
-    vertex[:-1, :-1] += first + second
-    vertex[:-1, 1:] += first
-    vertex[1:, 1:] += first + second
-    vertex[1:, :-1] += second
-    if closed:
-        vertex[:, 0] += vertex[:, -1]
-        vertex[:, -1] = vertex[:, 0]
-    vertex /= np.maximum(np.linalg.norm(vertex, axis=2, keepdims=True), 1e-12)
-    corner = grid_triangles(vertex)
-    face = np.stack([first, second], axis=2).reshape(-1, 3)
-    face /= np.maximum(np.linalg.norm(face, axis=1, keepdims=True), 1e-12)
-    smooth = np.einsum("tij,tj->ti", corner, face) > crease
-    return np.where(smooth[:, :, None], corner, face[:, None, :])
-
-
-def grid_triangles(values: NDArray[np.floating]) -> NDArray[np.float64]:
-    """(2 (R-1) (C-1), 3, D) triangles of an (R, C, D) grid."""
-    a, b, c, d = values[:-1, :-1], values[:-1, 1:], values[1:, 1:], values[1:, :-1]
-    both = np.stack([np.stack([a, b, c], axis=2), np.stack([a, c, d], axis=2)], axis=2)
-    return both.reshape(-1, 3, values.shape[-1]).astype(np.float64)
+    corners, places, normals = grid_triangles(p, np.asarray(uv, dtype=np.float64), closed, crease)
+    return make_mesh(corners, material, colour, places, normals, seed)
 
 
 def tube(
