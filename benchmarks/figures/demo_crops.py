@@ -9,7 +9,7 @@ from PIL import Image
 
 IMAGES = Path(__file__).parents[2] / "docs" / "images"
 # left, top, right, bottom in pixels of the whole picture
-CROPS = {"demo_phone.jpg": (545, 150, 1010, 400), "reasons.jpg": (440, 150, 1242, 402)}
+CROPS = {"demo_phone.jpg": (338, 150, 972, 400), "reasons.jpg": (220, 150, 1022, 402)}
 
 if __name__ == "__main__":
     whole = Image.open(IMAGES / "demo.jpg")
