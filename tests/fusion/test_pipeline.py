@@ -62,9 +62,9 @@ def test_scores_of_a_match_are_the_ensemble():
 
 
 def test_the_camera_decides_the_label():
-    fused = fuse(lidar([NEAR], [0.8], [CYCLIST]), {"left": seen(camera(), [NEAR], [0.7], [CAR])})
+    fused = fuse(lidar([NEAR], [0.8], [CYCLIST]), {"left": seen(camera(), [NEAR], [0.85], [CAR])})
     assert fused.detections.labels.tolist() == [CAR]
-    assert fused.detections.scores.tolist() == [0.7]
+    assert fused.detections.scores.tolist() == [0.85]
 
 
 @pytest.mark.parametrize(("relabel_score", "label", "score"), [(0.69, CAR, 0.7), (0.7, CYCLIST, 0.8)])

@@ -100,7 +100,7 @@ def test_scores_of_three_terms():
 def test_only_terms_that_agree_with_the_more_confident_view_count(lidar_label, left, right, label, score):
     views = rig()
     found = {v.name: seen(v, [NEAR], [s], [c]) for v, (s, c) in zip(views, (left, right), strict=True)}
-    fused = fuse(lidar([NEAR], [0.8], [lidar_label]), found)
+    fused = fuse(lidar([NEAR], [0.8], [lidar_label]), found, relabel_score=0.0)
     assert fused.detections.labels.tolist() == [label]
     assert fused.detections.scores[0] == pytest.approx(score)
 

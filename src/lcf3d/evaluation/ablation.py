@@ -89,7 +89,7 @@ def variants(config: FusionConfig, scans: bool, masks: bool) -> list[Variant]:
         scans: whether the frames have LiDAR scans.
         masks: whether camera detections have instance masks.
     """
-    semantic = {"ensemble": "probabilistic"}
+    semantic = {"ensemble": "probabilistic", "relabel_score": 0.0}
     rows = [
         Variant(MODULES, "none: LiDAR alone", None),
         Variant(MODULES, "recovery only", {**_FILTER, "unmatched": "keep", "recovery": True}),

@@ -86,7 +86,7 @@ class FusionConfig(BaseModel):
         description="ensemble evidence: weights by class, or by role for classes that are not named",
     )
     relabel_score: Fraction = Field(
-        default=0.0, description="where labels differ, a 2D detection above it gives label and score (Algorithm 1: all)"
+        default=0.8, description="where labels differ, a 2D detection above it gives label and score (Algorithm 1: all)"
     )
     priors: dict[str, Annotated[float, Field(gt=0, lt=1)]] = Field(
         default_factory=dict, description="prior by class; classes left out are uniform"
@@ -246,6 +246,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "unmatched": "drop",
         "out_of_view": "drop",
         "ensemble": "product",
+        "relabel_score": 0.0,
         "min_quality": 0.0,
     },
     # measured: docs/when-fusion-helps.md. KITTI labels only what the front cameras see
@@ -256,11 +257,10 @@ PRESETS: dict[str, dict[str, Any]] = {
         "decisive_score": 0.2,
         "lidar_score_threshold": 0.05,
         "enlargement": 0.0,
-        "relabel_score": 0.8,
         "evidence": _BY_CENTRE,
     },
     # measured with simulated camera detections only: docs/argoverse2.md
-    "argoverse2": {"class_names": ARGOVERSE_CLASSES, "relabel_score": 0.8, "evidence": _BY_CENTRE},
+    "argoverse2": {"class_names": ARGOVERSE_CLASSES, "evidence": _BY_CENTRE},
 }
 
 
