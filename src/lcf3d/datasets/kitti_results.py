@@ -26,6 +26,7 @@ from lcf3d.formats.kitti import (
 )
 from lcf3d.formats.kitti_tracking import write_tracks
 from lcf3d.frame import Frame
+from lcf3d.fusion.memory_identity import tracked_rows
 from lcf3d.geometry.boxes import lidar_from_kitti
 from lcf3d.geometry.camera import project_boxes
 from lcf3d.provenance import FusedDetections
@@ -237,10 +238,14 @@ class KittiWriter:
                 sequences.setdefault(sequence, []).append((number, frame_id))
         for sequence, frames in sequences.items():
             numbers, names = zip(*sorted(frames), strict=True)
-            tables = [read(name).tracks for name in names]
-            ids = [table.ids for table in tables if table is not None]
-            if len(ids) == len(names):
-                objects = [read_objects(self.folder / f"{name}.txt", results=True) for name in names]
+            results = [read(name) for name in names]
+            rows = [own for own in map(tracked_rows, results) if own is not None]
+            if len(rows) == len(names):
+                ids = [fused.tracks.ids[own] for fused, own in zip(results, rows, strict=True) if fused.tracks]
+                objects = [
+                    read_objects(self.folder / f"{name}.txt", results=True)[own]
+                    for name, own in zip(names, rows, strict=True)
+                ]
                 write_tracks(self.tracks / f"{sequence}.txt", numbers, ids, objects)
 
     def written(self) -> Iterator[Path]:
