@@ -41,13 +41,13 @@ def test_a_switch_a_miss_and_a_false_alarm_counted_by_hand():
 def test_a_switch_over_a_gap_counts_in_clear_but_not_in_the_form_of_kitti():
     one = sequence([[1]] * 3, [[7], [], [9]], [[[0.8]], np.zeros((1, 0)), [[0.8]]])
     assert clear([one], 0.25).switches == 1
-    assert clear([one], 0.25, keep=False).switches == 0
+    assert clear([one], 0.25, keep="never").switches == 0
 
 
 def test_matches_are_kept_where_they_still_overlap():
     one = sequence([[1], [1]], [[7], [8, 7]], [[[0.8]], [[0.9, 0.4]]])
     assert clear([one], 0.25).switches == 0
-    assert clear([one], 0.25, keep=False).switches == 1
+    assert clear([one], 0.25, keep="never").switches == 1
 
 
 def test_averaging_over_recall_by_hand():
