@@ -213,10 +213,10 @@ def evaluate_nuscenes(
     truth = ground_truth_boxes(tables, sample_rows)
     if not len(tables.annotations.tokens):
         raise DatasetError(f"{tables.root / tables.version} holds no annotations, so that nothing can be evaluated")
-    found = _aligned(predictions, truth.sample_tokens)
+    found = aligned(predictions, truth.sample_tokens)
     lidar = tables.samples.lidar[sample_rows]
     ego = tables.sensor_data.pose_translations[lidar]
-    racks = _rack_filter(tables, sample_rows)
+    racks = rack_filter(tables, sample_rows)
     counts, kept = {}, {}
     for name, boxes in (("predictions", found), ("ground_truth", truth)):
         in_range = boxes_in_range(boxes, ego, config)
@@ -264,8 +264,12 @@ def boxes_in_range(boxes: GlobalBoxes, ego: FloatArray, config: NuscenesMetricsC
     return inside
 
 
-def _aligned(predictions: GlobalBoxes, tokens: tuple[str, ...]) -> GlobalBoxes:
-    """``predictions`` with sample numbers of ``tokens``, box order kept."""
+def aligned(predictions: GlobalBoxes, tokens: tuple[str, ...]) -> GlobalBoxes:
+    """``predictions`` with sample numbers of ``tokens``, box order kept.
+
+    Raises:
+        FormatError: predictions of other samples than these, or none for some of them.
+    """
     position = {token: i for i, token in enumerate(tokens)}
     missing = set(tokens) - set(predictions.sample_tokens)
     if missing and len(missing) == len(tokens):
@@ -300,7 +304,7 @@ def _aligned(predictions: GlobalBoxes, tokens: tuple[str, ...]) -> GlobalBoxes:
     )
 
 
-def _rack_filter(tables: NuscenesTables, sample_rows: IntArray) -> Any:
+def rack_filter(tables: NuscenesTables, sample_rows: IntArray) -> Any:
     """A function that tells (N,) which bicycles and motorcycles have their centre in (or on) a bicycle rack."""
     rows, samples = bicycle_racks(tables, sample_rows)
     centers, half = tables.annotations.translations[rows], tables.annotations.sizes[rows][:, [1, 0, 2]] / 2

@@ -13,7 +13,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from lcf3d.structures import FloatArray, IntArray
+from lcf3d.structures import BoolArray, FloatArray, IntArray
 
 Keep = Literal["previous", "ever", "never"]
 
@@ -143,13 +143,13 @@ class Match(NamedTuple):
     Attributes:
         rows: (K,) of the objects.
         columns: (K,) of the outputs.
-        switches: how many of the objects have another track than before.
-        fragments: how many of them were found before, and lost in between.
+        switched: (K,) whether the object has another track than before.
+        fragments: how many of the objects were found before, and lost in between.
     """
 
     rows: IntArray
     columns: IntArray
-    switches: int
+    switched: BoolArray
     fragments: int
 
 
@@ -172,8 +172,8 @@ def matches(sequence: TrackedFrames, min_overlap: float, keep: Keep) -> Iterator
         rows, columns = np.append(kept_rows, rows), np.append(kept_columns, columns)
         reference = previous if keep == "never" else last
         pairs = dict(zip(truth[rows].tolist(), found[columns].tolist(), strict=True))
-        switches = sum(reference.get(g, p) != p for g, p in pairs.items())
-        yield Match(rows, columns, switches, sum(g in last and g not in previous for g in pairs))
+        switched = np.array([reference.get(g, p) != p for g, p in pairs.items()], dtype=bool)
+        yield Match(rows, columns, switched, sum(g in last and g not in previous for g in pairs))
         last.update(pairs)
         if keep == "never" or (len(truth) and len(found)):
             previous = pairs
@@ -204,7 +204,7 @@ def _clear_of(sequence: TrackedFrames, min_overlap: float, keep: Keep) -> FloatA
     for match, found, overlaps in zip(matched, sequence.found, sequence.overlaps, strict=True):
         hits += len(match.rows)
         false_alarms += len(found) - len(match.rows)
-        switches += match.switches
+        switches += int(match.switched.sum())
         fragments += match.fragments
         overlap += float(overlaps[match.rows, match.columns].sum())
     return np.array([objects, hits, objects - hits, false_alarms, switches, fragments, overlap])
