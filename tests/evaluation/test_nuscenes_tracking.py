@@ -124,7 +124,10 @@ def test_classes_without_objects_and_all_together(measure):
 
 
 def test_only_the_samples_of_the_run_count(measure):
-    result = measure([box(0), box(1), box(2, place=[140.0, 50.0, 1.0])], frame_ids=SAMPLES[:2])
+    with pytest.raises(FormatError, match="hold boxes of 1 samples that are not in this split, the first is s2"):
+        measure([box(0), box(1), box(2)], frame_ids=SAMPLES[:2])
+    # a run on a part lists the other samples without boxes
+    result = measure([box(0), box(1)], frame_ids=SAMPLES[:2])
     assert (car(result)["tp"], car(result)["fp"], car(result)["gt"]) == (2, 0, 2)
     assert result.table().notes[-1].startswith("counted: 2 of the 3 frames of 1 scene")
     with pytest.raises(FormatError, match="lack 1 of 3 samples, the first is s2"):
@@ -141,6 +144,10 @@ def test_files_that_are_no_tracks(measure):
     ):
         with pytest.raises(FormatError, match=message):
             measure([box(0, **change)])
+    detection = {"sample_token": "s0", **{key: box(0)[key] for key in ("translation", "size", "rotation", "velocity")}}
+    detection |= {"detection_name": "car", "detection_score": 0.9, "attribute_name": ""}
+    with pytest.raises(FormatError, match="has no 'tracking_score': it has 'detection_name', so this is another kind"):
+        measure([detection])
     without = box(0)
     del without["tracking_id"]
     with pytest.raises(FormatError, match="a box of sample s0 has no 'tracking_id'"):

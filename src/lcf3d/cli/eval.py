@@ -76,7 +76,7 @@ def eval(
         from lcf3d.cli.eval_tracking import eval_tracking
 
         chosen = frames or (data.ids if whole or split is not None else None)
-        eval_tracking(data, chosen, options, places[0], missing, json_)
+        eval_tracking(data, chosen, options, as_files(places[0], data), missing, json_)
         return
     evaluation = open_evaluation(data, frames or (data.ids if whole else None), options)
     names = result_names(results)

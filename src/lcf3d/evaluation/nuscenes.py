@@ -283,13 +283,15 @@ def aligned(predictions: GlobalBoxes, tokens: tuple[str, ...]) -> GlobalBoxes:
             f"the results lack {len(missing)} of {len(tokens)} samples, the first is {first}; "
             "list every sample of the split, with an empty list where nothing was detected"
         )
-    unknown = [token for token in predictions.sample_tokens if token not in position]
+    # a run on a part of the samples lists the others without boxes
+    filled = {predictions.sample_tokens[i] for i in np.unique(predictions.samples).tolist()}
+    unknown = [token for token in predictions.sample_tokens if token in filled and token not in position]
     if unknown:
         raise FormatError(
-            f"the results hold {len(unknown)} samples that are not in this split, the first is {unknown[0]}; "
+            f"the results hold boxes of {len(unknown)} samples that are not in this split, the first is {unknown[0]}; "
             "check version and split"
         )
-    numbers = np.array([position[token] for token in predictions.sample_tokens], dtype=np.int64)
+    numbers = np.array([position.get(token, -1) for token in predictions.sample_tokens], dtype=np.int64)
     return GlobalBoxes(
         tokens,
         numbers[predictions.samples],

@@ -54,11 +54,7 @@ class NuscenesTracking:
             FormatError: not a tracking submission, or one of other samples.
         """
         boxes, ids, meta = read_tracking(path / "tracking.json" if path.is_dir() else path)
-        known = set(self.tokens)
-        if missing == "empty" and known & set(boxes.sample_tokens):
-            boxes, ids = _with_samples(boxes, ids, self.tokens)
-        elif known < set(boxes.sample_tokens):
-            # a run notes its frames, and its submission lists every sample of the split
+        if missing == "empty" and set(self.tokens) & set(boxes.sample_tokens):
             boxes, ids = _with_samples(boxes, ids, self.tokens)
         metrics = evaluate_nuscenes_tracking(self.tables, self.rows, boxes, ids, self.classes, meta)
         scenes = np.unique(self.tables.samples.scenes[self.rows])

@@ -173,4 +173,6 @@ def refuse_options(what: str, options: EvaluationOptions, *names: str) -> None:
 def frames_note(counted: int, every: int, drives: int, name: str) -> str:
     """How many frames of how many a measure counts, in a sentence; ``name`` is what the data set calls its drives."""
     of = f"frames of {drives} {name}{'' if drives == 1 else 's'}"
-    return f"counted: all {every} {of}" if counted == every else f"counted: {counted} of the {every} {of}: those that the run covers"
+    if counted == every:
+        return f"counted: all {every} {of}"
+    return f"counted: {counted} of the {every} {of}: those that the run covers"

@@ -193,7 +193,9 @@ def _read_sample(path: Path, token: str, boxes: Any, max_boxes: int, form: _Form
                 raise FormatError(f"{path}: {key} of a box of sample {token} must be text or a whole number")
             arrays[key] = [str(box[key]) for box in boxes]
     except KeyError as error:
-        raise FormatError(f"{path}: a box of sample {token} has no {error.args[0]!r}") from None
+        other = "detection_name" if form is _TRACKS else "tracking_name"
+        hint = f": it has {other!r}, so this is another kind of file" if any(other in box for box in boxes) else ""
+        raise FormatError(f"{path}: a box of sample {token} has no {error.args[0]!r}{hint}") from None
     except TypeError:
         raise FormatError(f"{path}: {key} of a box of sample {token} must be text") from None
     if any(box.get("sample_token", token) != token for box in boxes):
