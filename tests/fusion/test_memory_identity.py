@@ -5,12 +5,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from lcf3d.datasets.kitti_results import KittiWriter
+from lcf3d.formats.kitti_tracking import read_tracks
+from lcf3d.frame import Frame
 from lcf3d.fusion.memory import remember_sequence
-from lcf3d.fusion.memory_identity import keep_numbers, tracked_rows
+from lcf3d.fusion.memory_identity import keep_numbers, tracked
 from lcf3d.fusion.memory_motion import begin
 from lcf3d.fusion.memory_state import ID, LABEL, NUMBER_HITS, Tracks
 
-from .scenes import PEDESTRIAN, car, pedestrian
+from .scenes import PEDESTRIAN, camera, car, pedestrian
 from .test_memory import frame, fused
 
 
@@ -92,17 +95,31 @@ def test_a_second_box_of_one_frame_does_not_change_the_number():
     assert results[-1].tracks.ages_s[~results[-1].tracks.predicted] == pytest.approx([0.8])
 
 
+def test_frames_without_outputs_are_in_the_file(tmp_path):
+    results = remember_sequence(
+        [(frame(0.1 * t), fused([car(20)], [0.9]) if t == 1 else fused([], [])) for t in range(3)]
+    )
+    by_id = {f"0000_{t:06d}": result for t, result in enumerate(results)}
+    writer = KittiWriter(tmp_path)
+    for frame_id, result in by_id.items():
+        writer.write(Frame(frame_id, cameras=(camera(),)), result)
+    writer.finish(tuple(by_id), by_id.__getitem__)
+    tracks = read_tracks(tmp_path / "tracks/0000.txt", results=True)
+    assert (tracks.frames.tolist(), tracks.ids.tolist()) == ([1], [0])
+
+
 def test_files_of_tracks_leave_out_what_is_hardly_probable():
     seen = [(frame(0.1 * t), fused([car(20), pedestrian(8, 2)], [0.95, 0.6], [0, PEDESTRIAN])) for t in range(6)]
     missed = [(frame(0.1 * t), fused([], [])) for t in range(6, 20)]
     results = list(remember_sequence(seen + missed))
-    assert tracked_rows(results[5]).tolist() == [0, 1]
+    assert tracked(results[5]).rows.tolist() == [0, 1]
     left_out = 0
     for result in results[6:]:
-        rows = tracked_rows(result)
+        rows, ids = tracked(result)
+        assert ids.tolist() == result.tracks.ids[rows].tolist()
         expected = np.flatnonzero(result.detections.scores >= 0.05)
         assert rows.tolist() == expected.tolist()
         left_out += len(result) - len(rows)
     assert left_out > 0
-    assert len(tracked_rows(results[6])) > 0
-    assert tracked_rows(fused([car(20)], [0.9])) is None
+    assert len(tracked(results[6]).rows) > 0
+    assert tracked(fused([car(20)], [0.9])) is None

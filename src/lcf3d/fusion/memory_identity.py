@@ -8,6 +8,8 @@ belongs to one track at any time. Scores, boxes and predictions do not depend on
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from lcf3d.fusion.memory_motion import place
@@ -69,7 +71,14 @@ def _exchange(numbers, values, rows, own, boxes, reach):  # type: ignore[no-unty
             values[row, BORN], values[other_row, BORN] = values[other_row, BORN], values[row, BORN]
 
 
-def tracked_rows(fused: FusedDetections) -> IntArray | None:
+class Tracked(NamedTuple):
+    """Outputs of a frame that a file of tracks holds: (K,) their rows, and (K,) numbers."""
+
+    rows: IntArray
+    ids: IntArray
+
+
+def tracked(fused: FusedDetections) -> Tracked | None:
     """The outputs that a file of tracks holds; None where the frame was judged alone.
 
     All that the frame saw, and predicted boxes that are probable enough and still have the number that was seen. For
@@ -78,4 +87,5 @@ def tracked_rows(fused: FusedDetections) -> IntArray | None:
     if fused.tracks is None:
         return None
     likely = (fused.detections.scores >= LEAST_PREDICTED_SCORE) & (fused.tracks.hits > 0)
-    return np.flatnonzero(~fused.tracks.predicted | likely)
+    rows = np.flatnonzero(~fused.tracks.predicted | likely)
+    return Tracked(rows, fused.tracks.ids[rows])
