@@ -11,6 +11,7 @@ from lcf3d.errors import ConfigError, DatasetError, FormatError
 from lcf3d.evaluation.opening import open_tracking
 from lcf3d.evaluation.protocol import EvaluationOptions
 from lcf3d.formats.kitti_tracking import read_tracks
+from tests.datasets.kitti_drives import make_tracking
 
 
 def line(frame, track, name="Car", x=0.0, occluded=0, truncated=0, score=None, box="100 100 200 200"):
@@ -106,6 +107,19 @@ def test_only_the_frames_of_the_run_count(world):
     world(truth, [*box(), *(line(t, 30, x=30, score=0.9) for t in range(5, 10))])
     part = measure(world.root, [f"0000_{t:06d}" for t in range(5)])
     assert part.metrics["Car"].averaged.best.false_alarms == 0
+
+
+def test_the_layout_of_the_tracking_benchmark(tmp_path):
+    root, out = make_tracking(tmp_path / "tracking"), tmp_path / "out"
+    out.mkdir()
+    for path in (root / "training/label_02").glob("*.txt"):
+        lines = [text for text in path.read_text().splitlines() if text.split()[1] != "-1"]
+        (out / path.name).write_text("".join(f"{text} 0.9\n" for text in lines))
+    measured = open_tracking(open_dataset(f"kitti-tracking:{root}")).read(out)
+    best = measured.metrics["Car"].averaged.best
+    assert best.false_alarms == best.switches == 0
+    assert set(measured.counted) == {"0000", "0001"}
+    assert "of 2 sequences" in measured.table().notes[1]
 
 
 def test_a_sequence_without_results(world):
