@@ -9,7 +9,7 @@ from lcf3d.datasets.kitti_results import KittiWriter
 from lcf3d.formats.kitti_tracking import read_tracks
 from lcf3d.frame import Frame
 from lcf3d.fusion.memory import remember_sequence
-from lcf3d.fusion.memory_identity import keep_numbers, tracked
+from lcf3d.fusion.memory_identity import LEAST_PREDICTED_SCORE, keep_numbers, tracked
 from lcf3d.fusion.memory_motion import begin
 from lcf3d.fusion.memory_state import ID, LABEL, NUMBER_HITS, Tracks
 
@@ -117,7 +117,7 @@ def test_files_of_tracks_leave_out_what_is_hardly_probable():
     for result in results[6:]:
         rows, ids = tracked(result)
         assert ids.tolist() == result.tracks.ids[rows].tolist()
-        expected = np.flatnonzero(result.detections.scores >= 0.05)
+        expected = np.flatnonzero(result.detections.scores >= LEAST_PREDICTED_SCORE)
         assert rows.tolist() == expected.tolist()
         left_out += len(result) - len(rows)
     assert left_out > 0
