@@ -89,6 +89,17 @@ def random_sequence(seed):
 
 
 @pytest.mark.parametrize("seed", range(5))
+def test_the_best_point_is_that_of_the_outputs_above_its_threshold(seed):
+    one, rng = random_sequence(seed), np.random.default_rng(seed)
+    # few different scores, so that many outputs go at once
+    scored = sequence(one.truth, one.found, one.overlaps, [rng.integers(1, 5, len(own)) / 5 for own in one.found])
+    result = averaged([scored], 0.25)
+    counts = clear([scored.above(result.threshold)], 0.25, keep="never")
+    assert counts == result.best
+    assert counts.hits + counts.false_alarms == sum(int((own >= result.threshold).sum()) for own in scored.scores)
+
+
+@pytest.mark.parametrize("seed", range(5))
 def test_against_trackeval(seed):
     trackeval = pytest.importorskip("trackeval", reason="the oracle, not a dependency: pip install trackeval")
     one = random_sequence(seed)
