@@ -6,14 +6,25 @@ import pytest
 from typer.testing import CliRunner
 
 from lcf3d.cli.app import app
-from lcf3d.errors import DatasetError, FormatError
-from lcf3d.evaluation.kitti_tracking import evaluate_tracks
+from lcf3d.datasets.opening import open_dataset
+from lcf3d.errors import ConfigError, DatasetError, FormatError
+from lcf3d.evaluation.opening import open_tracking
+from lcf3d.evaluation.protocol import EvaluationOptions
 from lcf3d.formats.kitti_tracking import read_tracks
+from tests.datasets.kitti_drives import make_tracking
 
 
 def line(frame, track, name="Car", x=0.0, occluded=0, truncated=0, score=None, box="100 100 200 200"):
     text = f"{frame} {track} {name} {truncated} {occluded} -1.5 {box} 1.5 1.6 4.0 {x} 1.6 20.0 0.0"
     return text + ("" if score is None else f" {score}") + "\n"
+
+
+def measure(root, frame_ids=None, missing="error", out="out"):
+    return open_tracking(open_dataset(f"kitti:{root}"), frame_ids).read(root / out, missing)
+
+
+def box(score=0.9, **more):
+    return [line(t, 9, score=score, **more) for t in range(5)]
 
 
 @pytest.fixture
@@ -24,7 +35,7 @@ def world(tmp_path):
     def write(truth, found):
         (labels / "0000.txt").write_text("".join(truth))
         (results / "0000.txt").write_text("".join(found))
-        return evaluate_tracks(labels, results, classes=["Car"])["Car"]
+        return measure(tmp_path).metrics["Car"]
 
     write.root, write.out = tmp_path, tmp_path / "out"
     return write
@@ -80,5 +91,79 @@ def test_bad_files(world, tmp_path):
         bad.write_text(text)
         with pytest.raises(FormatError, match=message):
             read_tracks(bad, results=True)
-    with pytest.raises(DatasetError, match="not a folder"):
-        evaluate_tracks(tmp_path / "nowhere", tmp_path)
+
+
+def test_only_the_frames_of_the_run_count(world):
+    truth = [line(t, 4) for t in range(10)]
+    world(truth, box())
+    part = measure(world.root, [f"0000_{t:06d}" for t in range(5)])
+    assert part.metrics["Car"].averaged.best.mota == pytest.approx(100)
+    assert "counted: 5 of the 10 frames of 1 sequence: those" in part.table().notes[1]
+    assert part.to_json()["frames"] == {"0000": 5}
+    whole = measure(world.root)
+    assert whole.metrics["Car"].averaged.best.mota == pytest.approx(50)
+    assert "all 10 frames" in whole.table().notes[1]
+    # what the results hold besides is left out
+    world(truth, [*box(), *(line(t, 30, x=30, score=0.9) for t in range(5, 10))])
+    part = measure(world.root, [f"0000_{t:06d}" for t in range(5)])
+    assert part.metrics["Car"].averaged.best.false_alarms == 0
+
+
+def test_the_layout_of_the_tracking_benchmark(tmp_path):
+    root, out = make_tracking(tmp_path / "tracking"), tmp_path / "out"
+    out.mkdir()
+    for path in (root / "training/label_02").glob("*.txt"):
+        lines = [text for text in path.read_text().splitlines() if text.split()[1] != "-1"]
+        (out / path.name).write_text("".join(f"{text} 0.9\n" for text in lines))
+    measured = open_tracking(open_dataset(f"kitti-tracking:{root}")).read(out)
+    best = measured.metrics["Car"].averaged.best
+    assert best.false_alarms == best.switches == 0
+    assert set(measured.counted) == {"0000", "0001"}
+    assert "of 2 sequences" in measured.table().notes[1]
+
+
+def test_a_sequence_without_results(world):
+    world([line(t, 4) for t in range(5)], box())
+    labels = world.root / "training/label_02/0001.txt"
+    labels.write_text("".join(line(t, 4) for t in range(5)))
+    both = [f"{name}_{t:06d}" for name in ("0000", "0001") for t in range(5)]
+    with pytest.raises(DatasetError, match=r"lacks the tracks of 1 of 2 sequences, the first is 0001; --missing empty"):
+        measure(world.root, both)
+    assert measure(world.root, both, "empty").metrics["Car"].averaged.best.mota == pytest.approx(50)
+
+
+def test_results_of_other_scenes_and_without_numbers(world):
+    truth = [line(t, 4) for t in range(5)]
+    with pytest.raises(DatasetError, match="holds 1 frames that sequence 0000 does not have, the first is 7"):
+        world(truth, [*box(), line(7, 9, score=0.9)])
+    with pytest.raises(FormatError, match="2 boxes without a track number"):
+        world(truth, [line(0, -1, score=0.9), line(1, -1, score=0.9)])
+    with pytest.raises(FormatError, match="gives its objects no track numbers"):
+        world([line(t, -1) for t in range(5)], box())
+    (world.out / "tracks/0000.txt").rename(world.out / "tracks/0042.txt")
+    with pytest.raises(DatasetError, match=r"1 of 1 sequences have no labels .* the first is 0042"):
+        measure(world.root)
+    (world.out / "tracks/0042.txt").unlink()
+    with pytest.raises(DatasetError, match="holds no tracking results"):
+        measure(world.root)
+    with pytest.raises(DatasetError, match="is not a folder"):
+        measure(world.root, out="nowhere")
+
+
+def test_unknown_classes_options_and_ids(world):
+    world([line(t, 4) for t in range(5)], box())
+    data = open_dataset(f"kitti:{world.root}")
+    with pytest.raises(ConfigError, match="does not know class 'Tram'"):
+        open_tracking(data, None, EvaluationOptions(classes=("Tram",)))
+    with pytest.raises(ConfigError, match="--iou does not go with --tracking"):
+        open_tracking(data, None, EvaluationOptions(iou=("Car=0.5",)))
+    with pytest.raises(DatasetError, match="frame 000001 is of no sequence"):
+        open_tracking(data, ["000001"])
+
+
+def test_a_dataset_without_track_numbers(world, tmp_path):
+    (tmp_path / "plain/training/calib").mkdir(parents=True)
+    with pytest.raises(DatasetError, match="has none"):
+        open_tracking(open_dataset(f"kitti:{tmp_path / 'plain'}"))
+    with pytest.raises(DatasetError, match="object offers none"):
+        open_tracking(object())

@@ -103,8 +103,12 @@ def test_other_samples_are_refused(dataset: NuscenesDataset) -> None:
         evaluate(dataset, empty_global(("x",)))
     with pytest.raises(FormatError, match="lack 1 of 3 samples, the first is s1"):
         evaluate(dataset, empty_global(("s0", "s2")))
-    with pytest.raises(FormatError, match="1 samples that are not in this split, the first is x"):
-        evaluate(dataset, empty_global(("s0", "s1", "s2", "x")))
+    more = ("s0", "s1", "s2", "x")
+    truth = as_predictions(dataset.ground_truth())
+    with pytest.raises(FormatError, match="boxes of 1 samples that are not in this split, the first is x"):
+        evaluate(dataset, truth[:1].in_samples(more, 3))
+    # a run on a part of the samples lists the others without boxes
+    assert evaluate(dataset, truth[:1].in_samples(more, 0)).counts["predictions"].original == 1
 
 
 def test_tables_without_annotations(tmp_path: Path) -> None:

@@ -41,13 +41,13 @@ def test_a_switch_a_miss_and_a_false_alarm_counted_by_hand():
 def test_a_switch_over_a_gap_counts_in_clear_but_not_in_the_form_of_kitti():
     one = sequence([[1]] * 3, [[7], [], [9]], [[[0.8]], np.zeros((1, 0)), [[0.8]]])
     assert clear([one], 0.25).switches == 1
-    assert clear([one], 0.25, keep=False).switches == 0
+    assert clear([one], 0.25, keep="never").switches == 0
 
 
 def test_matches_are_kept_where_they_still_overlap():
     one = sequence([[1], [1]], [[7], [8, 7]], [[[0.8]], [[0.9, 0.4]]])
     assert clear([one], 0.25).switches == 0
-    assert clear([one], 0.25, keep=False).switches == 1
+    assert clear([one], 0.25, keep="never").switches == 1
 
 
 def test_averaging_over_recall_by_hand():
@@ -86,6 +86,17 @@ def random_sequence(seed):
         near[g[:, None] == p[None]] = rng.uniform(0.3, 1)
         truth.append(g), found.append(p), overlaps.append(near)
     return sequence(truth, found, overlaps)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_best_point_is_that_of_the_outputs_above_its_threshold(seed):
+    one, rng = random_sequence(seed), np.random.default_rng(seed)
+    # few different scores, so that many outputs go at once
+    scored = sequence(one.truth, one.found, one.overlaps, [rng.integers(1, 5, len(own)) / 5 for own in one.found])
+    result = averaged([scored], 0.25)
+    counts = clear([scored.above(result.threshold)], 0.25, keep="never")
+    assert counts == result.best
+    assert counts.hits + counts.false_alarms == sum(int((own >= result.threshold).sum()) for own in scored.scores)
 
 
 @pytest.mark.parametrize("seed", range(5))

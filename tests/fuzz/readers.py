@@ -205,6 +205,13 @@ SUBMISSION = {
         ]
     },
 }  # fmt: skip
+_TRACKED = {key: value for key, value in SUBMISSION["results"]["s0"][0].items() if key != "attribute_name"}
+TRACKING = {
+    "meta": SUBMISSION["meta"],
+    "results": {
+        "s0": [{key.replace("detection", "tracking"): v for key, v in _TRACKED.items()} | {"tracking_id": "1"}]
+    },
+}
 MAP = {"kind": "isotonic", "transform": "logit", "slope": 1.0, "points": [[0.0, 0.0], [1.0, 2.0]]}
 CAMERA_LIST = [{"sample_token": "s", "camera": "C", "bbox": [1, 2, 3, 4], "score": 0.5, "category_name": "car"}]
 COCO_INDEX = {"categories": [{"id": 3, "name": "car"}], "images": [{"id": 1, "file_name": "000001.png"}]}
@@ -221,6 +228,12 @@ READERS: dict[str, Reader] = {
     ),
     "kitti tracking": Reader(
         "a.txt", _text(f"0 1 {LABEL}\n" * 3), call("lcf3d.formats.kitti_drives:read_tracking_labels"), mutate_bytes
+    ),
+    "kitti tracks": Reader(
+        "a.txt",
+        _text("".join(f"{frame} 1 {LABEL} 0.9\n" for frame in range(3))),
+        call("lcf3d.formats.kitti_tracking:read_tracks", True),
+        mutate_bytes,
     ),
     "kitti calibration": Reader(
         "a.txt", _text(calibration_text()), call("lcf3d.datasets.kitti_calibration:read_calibration"), mutate_bytes
@@ -252,6 +265,7 @@ READERS: dict[str, Reader] = {
         "a.json", _json(CAMERA_LIST), call("lcf3d.formats.coco:read_camera_detections", NUSCENES_CLASSES), mutate_json
     ),
     "submission": Reader("a.json", _json(SUBMISSION), call("lcf3d.formats.nuscenes:read_submission"), mutate_json),
+    "tracking submission": Reader("a.json", _json(TRACKING), call("lcf3d.formats.nuscenes:read_tracking"), mutate_json),
     "plain 3d": _plain(3),
     "plain 2d": _plain(2),
     "provenance": Reader("run/provenance/f.json", _provenance, _read_provenance, mutate_json),

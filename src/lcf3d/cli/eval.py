@@ -36,7 +36,7 @@ def eval(
     front: Annotated[bool, typer.Option("--front", help="only what the front camera sees (not KITTI)")] = False,
     nds_hat: Annotated[bool, typer.Option("--nds-hat", help="NDS^: no velocity, no attributes")] = False,
     tracking: Annotated[
-        bool, typer.Option("--tracking", help="tracks of 'lcf3d run --memory' or of another tracker (KITTI)")
+        bool, typer.Option("--tracking", help="tracks of 'lcf3d run --memory' or of another tracker")
     ] = False,
     json_: Annotated[bool, typer.Option("--json", help="print the metrics as JSON")] = False,
 ) -> None:
@@ -49,6 +49,8 @@ def eval(
     Example: lcf3d eval nuscenes:NUSCENES results.json
 
     Example: lcf3d eval kitti:KITTI_TRACKING fused --tracking
+
+    Example: lcf3d eval nuscenes:NUSCENES tracking.json --tracking
     """
     import json
     from time import monotonic
@@ -63,18 +65,19 @@ def eval(
 
     started = monotonic()
     _check(results, compare, out)
-    if tracking:
-        from lcf3d.cli.eval_tracking import eval_tracking
-
-        if compare or out is not None:
-            raise ConfigError("--tracking measures one result and writes no report; leave out --compare and --out")
-        eval_tracking(dataset, local(results[0]), tuple(class_ or ()), json_)
-        return
+    if tracking and (compare or out is not None):
+        raise ConfigError("--tracking measures one result and writes no report; leave out --compare and --out")
     require_missing(missing)
     options = EvaluationOptions(tuple(class_ or ()), tuple(iou or ()), front, nds_hat)
     places = [local(path) for path in results]
     split, frames, whole = _frames_of_run(places[0], split)
     data = open_dataset(dataset, split=split, version=tables)
+    if tracking:
+        from lcf3d.cli.eval_tracking import eval_tracking
+
+        chosen = frames or (data.ids if whole or split is not None else None)
+        eval_tracking(data, chosen, options, as_files(places[0], data), missing, json_)
+        return
     evaluation = open_evaluation(data, frames or (data.ids if whole else None), options)
     names = result_names(results)
     sets = [evaluation.read(as_files(path, data), name, missing) for path, name in zip(places, names, strict=True)]

@@ -137,6 +137,8 @@ class BaseDataset(Sequence[Frame]):
     stereo_pair: tuple[str, str] | None = None
     preset: str = "default"
     evaluation: str = "lcf3d.evaluation.distance:DistanceEvaluation"
+    # ``module:name`` of a `lcf3d.evaluation.protocol.TrackingEvaluation`, where labels have track numbers
+    tracking: str | None = None
     native_from_canonical: FloatArray | None = None
 
     @abstractmethod

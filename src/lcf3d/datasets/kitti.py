@@ -117,6 +117,7 @@ class KittiDataset(KittiLikeDataset):
     """
 
     evaluation = "lcf3d.evaluation.kitti_task:KittiEvaluation"
+    tracking = "lcf3d.evaluation.kitti_tracking:KittiTracking"
 
     def __init__(
         self,

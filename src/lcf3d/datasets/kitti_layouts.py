@@ -173,6 +173,7 @@ class KittiTrackingDataset(KittiSequences):
 
     layout = "KITTI's tracking benchmark (training/calib/SEQUENCE.txt)"
     evaluation = "lcf3d.evaluation.kitti_task:KittiTrackingEvaluation"
+    tracking = "lcf3d.evaluation.kitti_tracking:KittiTracking"
 
     def __init__(
         self,

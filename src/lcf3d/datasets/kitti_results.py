@@ -26,6 +26,7 @@ from lcf3d.formats.kitti import (
 )
 from lcf3d.formats.kitti_tracking import write_tracks
 from lcf3d.frame import Frame
+from lcf3d.fusion.memory_identity import tracked
 from lcf3d.geometry.boxes import lidar_from_kitti
 from lcf3d.geometry.camera import project_boxes
 from lcf3d.provenance import FusedDetections
@@ -237,11 +238,13 @@ class KittiWriter:
                 sequences.setdefault(sequence, []).append((number, frame_id))
         for sequence, frames in sequences.items():
             numbers, names = zip(*sorted(frames), strict=True)
-            tables = [read(name).tracks for name in names]
-            ids = [table.ids for table in tables if table is not None]
-            if len(ids) == len(names):
-                objects = [read_objects(self.folder / f"{name}.txt", results=True) for name in names]
-                write_tracks(self.tracks / f"{sequence}.txt", numbers, ids, objects)
+            kept = [own for own in (tracked(read(name)) for name in names) if own is not None]
+            if len(kept) == len(names):
+                objects = [
+                    read_objects(self.folder / f"{name}.txt", results=True)[own.rows]
+                    for name, own in zip(names, kept, strict=True)
+                ]
+                write_tracks(self.tracks / f"{sequence}.txt", numbers, [own.ids for own in kept], objects)
 
     def written(self) -> Iterator[Path]:
         """The files of all frames, and the tracks."""

@@ -86,6 +86,7 @@ class NuscenesDataset(BaseDataset):
     camera_names = CAMERAS
     preset = "nuscenes"
     evaluation = "lcf3d.evaluation.nuscenes_task:NuscenesEvaluation"
+    tracking = "lcf3d.evaluation.nuscenes_tracking_task:NuscenesTracking"
     native_from_canonical = RAW_FROM_CANONICAL
 
     def __init__(

@@ -44,7 +44,7 @@ def ground_truth_boxes(tables: NuscenesTables, sample_rows: IntArray) -> GlobalB
     table = tables.annotations
     position = _positions(tables, sample_rows)
     labels = tables.detection_labels()
-    rows = np.flatnonzero((labels >= 0) & (position[table.samples] >= 0))
+    rows = _detection_rows(tables, sample_rows)
     tokens = tuple(token.decode() for token in tables.samples.tokens[sample_rows].tolist())
     return GlobalBoxes(
         tokens,
@@ -58,6 +58,18 @@ def ground_truth_boxes(tables: NuscenesTables, sample_rows: IntArray) -> GlobalB
         table.attributes[rows],
         table.point_counts[rows],
     )
+
+
+def ground_truth_instances(tables: NuscenesTables, sample_rows: IntArray) -> IntArray:
+    """(N,) object of each of the boxes of `ground_truth_boxes`."""
+    return tables.annotations.instances[_detection_rows(tables, sample_rows)]
+
+
+def _detection_rows(tables: NuscenesTables, sample_rows: IntArray) -> IntArray:
+    """Annotation rows of the ten detection classes in the given samples."""
+    position = _positions(tables, sample_rows)
+    rows: IntArray = np.flatnonzero((tables.detection_labels() >= 0) & (position[tables.annotations.samples] >= 0))
+    return rows
 
 
 def bicycle_racks(tables: NuscenesTables, sample_rows: IntArray) -> tuple[IntArray, IntArray]:

@@ -381,6 +381,7 @@ def _read_annotations(reader: _Reader, sample_index: _TokenIndex) -> tuple[tuple
         resolve(own_index, "next", "next", optional=True),
         table["num_lidar_pts"] + table["num_radar_pts"],
         number_of_attribute[attributes],
+        instances,
     )
 
 

@@ -13,6 +13,7 @@ from lcf3d.detectors.joins import LeftOut, join_cameras, join_classes, require_p
 from lcf3d.errors import FormatError
 from lcf3d.formats.coco import read_camera_detections
 from lcf3d.frame import Frame
+from lcf3d.fusion.memory_identity import tracked
 from lcf3d.provenance import FusedDetections
 from lcf3d.structures import Detections2D, Detections3D, IntArray
 
@@ -175,15 +176,16 @@ class NuscenesWriter:
 
     def finish(self, frame_ids: Sequence[str], read: Callable[[str], FusedDetections]) -> None:
         """Write the submission, and the tracks where there are any."""
-        detections, ids = {}, {}
+        detections, boxes, ids = {}, {}, {}
         for frame_id in frame_ids:
             fused = read(frame_id)
             detections[frame_id] = fused.detections
-            if fused.tracks is not None:
-                ids[frame_id] = fused.tracks.ids
+            own = tracked(fused)
+            if own is not None:
+                boxes[frame_id], ids[frame_id] = fused.detections[own.rows], own.ids
         self._write_results(self.path, detections)
         if ids:
-            self._write_tracks(self.tracking_path, {frame_id: detections[frame_id] for frame_id in ids}, ids)
+            self._write_tracks(self.tracking_path, boxes, ids)
 
     def written(self) -> Iterator[Path]:
         """The submissions."""

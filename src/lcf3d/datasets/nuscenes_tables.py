@@ -109,6 +109,7 @@ class Annotations:
         following: (A,) row of the one after, -1 where there is none.
         point_counts: (A,) LiDAR and radar points inside.
         attributes: (A,) indices into `NUSCENES_ATTRIBUTES`, -1 for none.
+        instances: (A,) number of the object, the same in all samples of its scene; -1 where it is unknown.
     """
 
     tokens: Tokens
@@ -121,6 +122,7 @@ class Annotations:
     following: IntArray
     point_counts: IntArray
     attributes: IntArray
+    instances: IntArray
 
 
 @dataclass(frozen=True, eq=False)

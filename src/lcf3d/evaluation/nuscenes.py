@@ -213,10 +213,10 @@ def evaluate_nuscenes(
     truth = ground_truth_boxes(tables, sample_rows)
     if not len(tables.annotations.tokens):
         raise DatasetError(f"{tables.root / tables.version} holds no annotations, so that nothing can be evaluated")
-    found = _aligned(predictions, truth.sample_tokens)
+    found = aligned(predictions, truth.sample_tokens)
     lidar = tables.samples.lidar[sample_rows]
     ego = tables.sensor_data.pose_translations[lidar]
-    racks = _rack_filter(tables, sample_rows)
+    racks = rack_filter(tables, sample_rows)
     counts, kept = {}, {}
     for name, boxes in (("predictions", found), ("ground_truth", truth)):
         in_range = boxes_in_range(boxes, ego, config)
@@ -264,8 +264,12 @@ def boxes_in_range(boxes: GlobalBoxes, ego: FloatArray, config: NuscenesMetricsC
     return inside
 
 
-def _aligned(predictions: GlobalBoxes, tokens: tuple[str, ...]) -> GlobalBoxes:
-    """``predictions`` with sample numbers of ``tokens``, box order kept."""
+def aligned(predictions: GlobalBoxes, tokens: tuple[str, ...]) -> GlobalBoxes:
+    """``predictions`` with sample numbers of ``tokens``, box order kept.
+
+    Raises:
+        FormatError: predictions of other samples than these, or none for some of them.
+    """
     position = {token: i for i, token in enumerate(tokens)}
     missing = set(tokens) - set(predictions.sample_tokens)
     if missing and len(missing) == len(tokens):
@@ -279,13 +283,15 @@ def _aligned(predictions: GlobalBoxes, tokens: tuple[str, ...]) -> GlobalBoxes:
             f"the results lack {len(missing)} of {len(tokens)} samples, the first is {first}; "
             "list every sample of the split, with an empty list where nothing was detected"
         )
-    unknown = [token for token in predictions.sample_tokens if token not in position]
+    # a run on a part of the samples lists the others without boxes
+    filled = {predictions.sample_tokens[i] for i in np.unique(predictions.samples).tolist()}
+    unknown = [token for token in predictions.sample_tokens if token in filled and token not in position]
     if unknown:
         raise FormatError(
-            f"the results hold {len(unknown)} samples that are not in this split, the first is {unknown[0]}; "
+            f"the results hold boxes of {len(unknown)} samples that are not in this split, the first is {unknown[0]}; "
             "check version and split"
         )
-    numbers = np.array([position[token] for token in predictions.sample_tokens], dtype=np.int64)
+    numbers = np.array([position.get(token, -1) for token in predictions.sample_tokens], dtype=np.int64)
     return GlobalBoxes(
         tokens,
         numbers[predictions.samples],
@@ -300,7 +306,7 @@ def _aligned(predictions: GlobalBoxes, tokens: tuple[str, ...]) -> GlobalBoxes:
     )
 
 
-def _rack_filter(tables: NuscenesTables, sample_rows: IntArray) -> Any:
+def rack_filter(tables: NuscenesTables, sample_rows: IntArray) -> Any:
     """A function that tells (N,) which bicycles and motorcycles have their centre in (or on) a bicycle rack."""
     rows, samples = bicycle_racks(tables, sample_rows)
     centers, half = tables.annotations.translations[rows], tables.annotations.sizes[rows][:, [1, 0, 2]] / 2

@@ -7,8 +7,9 @@ from dataclasses import replace
 from importlib import import_module
 
 from lcf3d.datasets.base import Dataset
+from lcf3d.errors import DatasetError
 from lcf3d.evaluation.distance import DistanceEvaluation
-from lcf3d.evaluation.protocol import Evaluation, EvaluationOptions
+from lcf3d.evaluation.protocol import Evaluation, EvaluationOptions, TrackingEvaluation
 
 DEFAULT = EvaluationOptions()
 
@@ -34,6 +35,31 @@ def open_evaluation(
         kind = DistanceEvaluation
         options = replace(options, front=True)
     evaluation: Evaluation = kind(dataset, frame_ids, options)
+    return evaluation
+
+
+def open_tracking(
+    dataset: Dataset, frame_ids: Sequence[str] | None = None, options: EvaluationOptions = DEFAULT
+) -> TrackingEvaluation:
+    """The measure of tracks that a dataset names.
+
+    Args:
+        dataset: with labels that have track numbers.
+        frame_ids: frames that count; those that the protocol takes by itself without them.
+        options: what was asked for.
+
+    Raises:
+        ConfigError: an option or class that it does not know.
+        DatasetError: the dataset has none, or no labels with track numbers.
+    """
+    name: str | None = getattr(dataset, "tracking", None)
+    if name is None:
+        raise DatasetError(
+            f"--tracking needs labels with track numbers, and {type(dataset).__name__} offers none; KITTI's sequences "
+            "(training/label_02) and nuScenes have them"
+        )
+    module, _, kind = name.partition(":")
+    evaluation: TrackingEvaluation = getattr(import_module(module), kind)(dataset, frame_ids, options)
     return evaluation
 
 

@@ -137,6 +137,26 @@ class Evaluation(Protocol):
         ...
 
 
+class TrackingResult(Protocol):
+    """Tracks read and measured."""
+
+    def to_json(self) -> dict[str, Any]:
+        """The measures as plain JSON values."""
+        ...
+
+    def table(self) -> TableData:
+        """The measures for people."""
+        ...
+
+
+class TrackingEvaluation(Protocol):
+    """The measure of tracks over some frames of a dataset."""
+
+    def read(self, path: Path, missing: str = "error") -> TrackingResult:
+        """Tracks in the dataset's form, or those of a run folder, measured."""
+        ...
+
+
 def refuse_options(what: str, options: EvaluationOptions, *names: str) -> None:
     """Refuse those of the named options that were given.
 
@@ -148,3 +168,11 @@ def refuse_options(what: str, options: EvaluationOptions, *names: str) -> None:
         if field.name in names and getattr(options, field.name) != getattr(defaults, field.name):
             flag = "class" if field.name == "classes" else field.name
             raise ConfigError(f"--{flag} does not go with {what}; leave it out")
+
+
+def frames_note(counted: int, every: int, drives: int, name: str) -> str:
+    """How many frames of how many a measure counts, in a sentence; ``name`` is what the data set calls its drives."""
+    of = f"frames of {drives} {name}{'' if drives == 1 else 's'}"
+    if counted == every:
+        return f"counted: all {every} {of}"
+    return f"counted: {counted} of the {every} {of}: those that the run covers"

@@ -6,14 +6,17 @@ All of them work on overlaps: what overlaps how much is decided beforehand, once
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from bisect import bisect_left
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from lcf3d.structures import FloatArray, IntArray
+from lcf3d.structures import BoolArray, FloatArray, IntArray
+
+Keep = Literal["previous", "ever", "never"]
 
 # recall positions of the averaged measures: 1/40, 2/40, ..., 1
 RECALLS = 40
@@ -120,48 +123,140 @@ class Hota(NamedTuple):
     loca: float
 
 
-def clear(sequences: Sequence[TrackedFrames], min_overlap: float, keep: bool = True) -> Clear:
+def clear(sequences: Sequence[TrackedFrames], min_overlap: float, keep: Keep = "previous") -> Clear:
     """Counts over some sequences.
 
     Args:
         sequences: truth and output.
         min_overlap: a hit overlaps so much at least.
-        keep: prefer the output that an object was matched with before (CLEAR MOT); otherwise every frame is assigned
-            by overlap alone and a switch needs two frames in a row, as in KITTI's program and AB3DMOT's.
+        keep: see `matches`; or ``never``: every frame is assigned by overlap alone and a switch needs two frames in a
+            row (KITTI's program and AB3DMOT's).
     """
-    total = np.zeros(7)
-    for sequence in sequences:
-        total += _clear_of(sequence, min_overlap, keep)
+    if keep == "never":
+        return _clear_above([_alone(sequence, min_overlap) for sequence in sequences], -np.inf)
+    return _sum([_clear_of(sequence, min_overlap, keep) for sequence in sequences])
+
+
+def _sum(counts: Sequence[tuple[float, ...]]) -> Clear:
+    """The counts of some sequences together."""
+    total = [sum(column) for column in zip(*counts, strict=True)] if counts else [0.0] * 7
     objects, hits, misses, false_alarms, switches, fragments = (int(count) for count in total[:6])
     return Clear(objects, hits, misses, false_alarms, switches, fragments, float(total[6]))
 
 
-def _clear_of(sequence: TrackedFrames, min_overlap: float, keep: bool) -> FloatArray:
-    """(7,) counts of one sequence, see `Clear`."""
+class Match(NamedTuple):
+    """Objects and outputs of a frame that belong together.
+
+    Attributes:
+        rows: (K,) of the objects.
+        columns: (K,) of the outputs.
+        switched: (K,) whether the object has another track than before.
+        fragments: how many of the objects were found before, and lost in between.
+    """
+
+    rows: IntArray
+    columns: IntArray
+    switched: BoolArray
+    fragments: int
+
+
+def matches(sequence: TrackedFrames, min_overlap: float, keep: Literal["previous", "ever"]) -> Iterator[Match]:
+    """Which outputs belong to which objects, frame after frame.
+
+    Args:
+        sequence: truth and output.
+        min_overlap: pairs overlap so much at least.
+        keep: an object stays with its track of the ``previous`` frame where both still overlap (CLEAR MOT, as in
+            TrackEval), or with the last track that it had ``ever`` (as in the nuScenes devkit).
+    """
     last: dict[int, int] = {}  # output track that each object was last matched with
     previous: dict[int, int] = {}  # the same in the frame before only
-    objects = hits = false_alarms = switches = fragments = 0
-    overlap = 0.0
     for truth, found, overlaps in zip(sequence.truth, sequence.found, sequence.overlaps, strict=True):
-        objects += len(truth)
-        reference = last if keep else previous
         gain = np.where(overlaps >= min_overlap, overlaps, 0.0)
-        if keep and len(truth) and len(found):
-            again = found[None] == np.array([previous.get(int(g), -1) for g in truth])[:, None]
-            gain = np.where(gain > 0, gain + 1000.0 * again, 0.0)
+        kept_rows, kept_columns = _kept(gain, truth, found, last if keep == "ever" else previous)
         rows, columns = _assigned(gain)
-        now: dict[int, int] = {}
-        for g, p in zip(truth[rows].tolist(), found[columns].tolist(), strict=True):
-            now[g] = p
-            switches += reference.get(g, p) != p
-            fragments += g in last and g not in previous
-        hits += len(rows)
-        false_alarms += len(found) - len(rows)
-        overlap += float(overlaps[rows, columns].sum())
-        last.update(now)
-        if not keep or (len(truth) and len(found)):
-            previous = now
-    return np.array([objects, hits, objects - hits, false_alarms, switches, fragments, overlap])
+        rows, columns = np.append(kept_rows, rows), np.append(kept_columns, columns)
+        pairs = dict(zip(truth[rows].tolist(), found[columns].tolist(), strict=True))
+        switched = np.array([last.get(g, p) != p for g, p in pairs.items()], dtype=bool)
+        yield Match(rows, columns, switched, sum(g in last and g not in previous for g in pairs))
+        last.update(pairs)
+        if len(truth) and len(found):
+            previous = pairs
+
+
+def _kept(gain: FloatArray, truth: IntArray, found: IntArray, before: Mapping[int, int]) -> tuple[IntArray, IntArray]:
+    """Rows and columns of pairs that stay together; ``gain`` is 0 in them afterwards."""
+    rows, columns = [], []
+    if before and gain.size:
+        column_of = {int(p): column for column, p in enumerate(found)}
+        for row, g in enumerate(truth.tolist()):
+            column = column_of.get(before.get(g, -1), -1)
+            if column >= 0 and gain[row, column] > 0:
+                rows.append(row)
+                columns.append(column)
+                gain[row], gain[:, column] = 0, 0
+    return np.array(rows, dtype=np.int64), np.array(columns, dtype=np.int64)
+
+
+def _clear_of(sequence: TrackedFrames, min_overlap: float, keep: Literal["previous", "ever"]) -> tuple[float, ...]:
+    """Counts of one sequence, in the order of `Clear`."""
+    objects = sum(len(truth) for truth in sequence.truth)
+    hits = false_alarms = switches = fragments = 0
+    overlap = 0.0
+    matched = matches(sequence, min_overlap, keep)
+    for match, found, overlaps in zip(matched, sequence.found, sequence.overlaps, strict=True):
+        hits += len(match.rows)
+        false_alarms += len(found) - len(match.rows)
+        switches += int(match.switched.sum())
+        fragments += match.fragments
+        overlap += float(overlaps[match.rows, match.columns].sum())
+    return objects, hits, objects - hits, false_alarms, switches, fragments, overlap
+
+
+class _Frame:
+    """A frame that is assigned by overlap alone, once for each number of outputs that a threshold leaves."""
+
+    def __init__(self, truth: IntArray, found: IntArray, scores: FloatArray, gain: FloatArray) -> None:
+        self.truth, self.found, self.scores, self.gain = truth, found, scores, gain
+        self._rising = sorted(scores.tolist())
+        self._known: dict[int, tuple[int, dict[int, int], float]] = {}
+
+    def above(self, score: float) -> tuple[int, dict[int, int], float]:
+        """Outputs of that score at least: how many, the track of each object that is found, and their overlap."""
+        n = len(self._rising) - bisect_left(self._rising, score)
+        if n not in self._known:
+            kept = np.flatnonzero(self.scores >= score)
+            rows, columns = _assigned(self.gain[:, kept])
+            tracks = self.found[kept[columns]].tolist()
+            overlap = float(self.gain[rows, kept[columns]].sum())
+            self._known[n] = n, dict(zip(self.truth[rows].tolist(), tracks, strict=True)), overlap
+        return self._known[n]
+
+
+def _alone(sequence: TrackedFrames, min_overlap: float) -> list[_Frame]:
+    """The frames of a sequence, pairs that overlap less left out."""
+    gains = [np.where(overlaps >= min_overlap, overlaps, 0.0) for overlaps in sequence.overlaps]
+    return [_Frame(*frame) for frame in zip(sequence.truth, sequence.found, sequence.scores, gains, strict=True)]
+
+
+def _clear_above(sequences: Sequence[Sequence[_Frame]], score: float) -> Clear:
+    """Counts of the outputs of that score at least, every frame assigned by overlap alone."""
+    counts = []
+    for frames in sequences:
+        last: dict[int, int] = {}
+        previous: dict[int, int] = {}
+        objects = sum(len(frame.truth) for frame in frames)
+        hits = outputs = switches = fragments = 0
+        overlap = 0.0
+        for frame in frames:
+            n, pairs, shared = frame.above(score)
+            hits, outputs, overlap = hits + len(pairs), outputs + n, overlap + shared
+            switches += sum(previous.get(g, p) != p for g, p in pairs.items())
+            fragments += sum(g in last and g not in previous for g in pairs)
+            last.update(pairs)
+            previous = pairs
+        counts.append((objects, hits, objects - hits, outputs - hits, switches, fragments, overlap))
+    return _sum(counts)
 
 
 def _assigned(gain: FloatArray) -> tuple[IntArray, IntArray]:
@@ -177,9 +272,10 @@ def averaged(sequences: Sequence[TrackedFrames], min_overlap: float) -> Averaged
     hits = np.concatenate([np.zeros(0), *(_hit_scores(sequence, min_overlap) for sequence in sequences)])
     thresholds, recalls = _thresholds(np.sort(hits)[::-1], objects)
     smoothed = mota = motp = 0.0
-    best, threshold = clear([s.above(np.inf) for s in sequences], min_overlap, keep=False), np.inf
+    frames = [_alone(sequence, min_overlap) for sequence in sequences]
+    best, threshold = _clear_above(frames, np.inf), np.inf
     for score, recall in zip(thresholds, recalls, strict=True):
-        counts = clear([sequence.above(score) for sequence in sequences], min_overlap, keep=False)
+        counts = _clear_above(frames, score)
         smoothed += counts.smoothed_mota(recall)
         mota += counts.mota
         motp += counts.motp

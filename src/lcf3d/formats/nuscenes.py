@@ -1,4 +1,8 @@
-"""nuScenes submission files: ``{"meta": {...}, "results": {sample_token: [box, ...]}}``, boxes in the global frame."""
+"""nuScenes submission files: ``{"meta": {...}, "results": {sample_token: [box, ...]}}``, boxes in the global frame.
+
+A tracking submission has ``tracking_name``, ``tracking_score`` and ``tracking_id`` in place of a detection's name,
+score and attribute.
+"""
 
 from __future__ import annotations
 
@@ -6,9 +10,10 @@ import json
 from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lcf3d.errors import DatasetError, FormatError
 from lcf3d.files import read_text, reading, write_text
@@ -18,20 +23,45 @@ from lcf3d.structures import NUSCENES_CLASSES, BoolArray, FloatArray
 
 MAX_BOXES_PER_SAMPLE = 500
 """The most boxes that the nuScenes benchmark accepts for one sample."""
+TRACKING_CLASSES = ("bicycle", "bus", "car", "motorcycle", "pedestrian", "trailer", "truck")
+"""The classes that the nuScenes tracking benchmark knows."""
 
 _META = {"use_camera": True, "use_lidar": True, "use_radar": False, "use_map": False, "use_external": False}
-_NUMBERS: dict[str, tuple[int, ...]] = {
-    "translation": (3,),
-    "size": (3,),
-    "rotation": (4,),
-    "velocity": (2,),
-    "detection_score": (),
-}
 _UNKNOWN = -2
-_NAMES = {
-    "detection_name": {name: i for i, name in enumerate(NUSCENES_CLASSES)},
-    "attribute_name": {name: i for i, name in enumerate(NUSCENES_ATTRIBUTES)} | {"": -1},
-}
+
+
+class _Form(NamedTuple):
+    """What the boxes of a kind of file have.
+
+    Attributes:
+        title: what the file is.
+        numbers: keys of numbers, and their shapes.
+        names: keys of names, and what each is as a number.
+        texts: keys of texts.
+    """
+
+    title: str
+    numbers: dict[str, tuple[int, ...]]
+    names: dict[str, dict[str, int]]
+    texts: tuple[str, ...] = ()
+
+
+_BOX: dict[str, tuple[int, ...]] = {"translation": (3,), "size": (3,), "rotation": (4,), "velocity": (2,)}
+_CLASSES = {name: i for i, name in enumerate(NUSCENES_CLASSES)}
+_DETECTIONS = _Form(
+    "a nuScenes submission",
+    {**_BOX, "detection_score": ()},
+    {
+        "detection_name": _CLASSES,
+        "attribute_name": {name: i for i, name in enumerate(NUSCENES_ATTRIBUTES)} | {"": -1},
+    },
+)
+_TRACKS = _Form(
+    "a nuScenes tracking submission",
+    {**_BOX, "tracking_score": ()},
+    {"tracking_name": {name: _CLASSES[name] for name in TRACKING_CLASSES}},
+    ("tracking_id",),
+)
 
 
 def read_submission(path: Path, max_boxes: int = MAX_BOXES_PER_SAMPLE) -> tuple[GlobalBoxes, dict[str, Any]]:
@@ -42,6 +72,29 @@ def read_submission(path: Path, max_boxes: int = MAX_BOXES_PER_SAMPLE) -> tuple[
             with a missing key, an unknown class or attribute, a score or coordinate that is not a finite number, or a
             size that is not positive. The message names the file and the sample.
     """
+    tokens, parts, meta = _read(path, _DETECTIONS, max_boxes)
+    return _join(path, tokens, parts, _DETECTIONS), meta
+
+
+def read_tracking(
+    path: Path, max_boxes: int = MAX_BOXES_PER_SAMPLE
+) -> tuple[GlobalBoxes, NDArray[np.str_], dict[str, Any]]:
+    """Boxes, the (N,) tracks that they belong to, and ``meta`` of a tracking submission, in file order.
+
+    Raises:
+        FormatError: see `read_submission`; also where a sample holds a track twice.
+    """
+    tokens, parts, meta = _read(path, _TRACKS, max_boxes)
+    for token, part in zip(tokens, parts, strict=True):
+        repeated = [name for name, times in Counter(part["tracking_id"]).items() if times > 1]
+        if repeated:
+            raise FormatError(f"{path}: sample {token} holds track {repeated[0]!r} twice; give each object its own id")
+    ids = np.array([own for part in parts for own in part["tracking_id"]], dtype=np.str_)
+    return _join(path, tokens, parts, _TRACKS), ids, meta
+
+
+def _read(path: Path, form: _Form, max_boxes: int) -> tuple[list[str], list[dict[str, Any]], dict[str, Any]]:
+    """Sample tokens, the arrays of each sample's boxes, and ``meta``."""
     try:
         cursor = JsonCursor(read_text(path))
     except DatasetError as error:
@@ -53,25 +106,25 @@ def read_submission(path: Path, max_boxes: int = MAX_BOXES_PER_SAMPLE) -> tuple[
     meta: dict[str, Any] | None = None
     found = False
     try:
-        with reading(path, "a nuScenes submission"):
+        with reading(path, form.title):
             for key in cursor.members():
                 if key == "results":
                     found = True
                     for token in cursor.members():
                         tokens.append(token)
-                        parts.append(_read_sample(path, token, cursor.value(), max_boxes))
+                        parts.append(_read_sample(path, token, cursor.value(), max_boxes, form))
                 elif key == "meta":
                     meta = cursor.value()
                 else:
                     cursor.value()
     except json.JSONDecodeError as error:
-        raise FormatError(f"{path}:{error.lineno}:{error.colno}: not a nuScenes submission ({error.msg})") from None
+        raise FormatError(f"{path}:{error.lineno}:{error.colno}: not {form.title} ({error.msg})") from None
     if not found:
-        raise FormatError(f"{path} has no 'results'; a nuScenes submission is {{'meta': ..., 'results': ...}}")
+        raise FormatError(f"{path} has no 'results'; {form.title} is {{'meta': ..., 'results': ...}}")
     repeated = [token for token, times in Counter(tokens).items() if times > 1]
     if repeated:
         raise FormatError(f"{path}: sample token {repeated[0]} occurs twice (as do {len(repeated) - 1} more)")
-    return _join(path, tokens, parts), meta or {}
+    return tokens, parts, meta or {}
 
 
 def write_submission(path: Path, boxes: GlobalBoxes, meta: Mapping[str, Any] | None = None) -> None:
@@ -109,8 +162,8 @@ def write_submission(path: Path, boxes: GlobalBoxes, meta: Mapping[str, Any] | N
     write_text(path, json.dumps({"meta": dict(_META if meta is None else meta), "results": results}) + "\n")
 
 
-def _read_sample(path: Path, token: str, boxes: Any, max_boxes: int) -> dict[str, Any]:
-    """Arrays by key of one sample's boxes; attributes and classes as indices."""
+def _read_sample(path: Path, token: str, boxes: Any, max_boxes: int, form: _Form) -> dict[str, Any]:
+    """Arrays by key of one sample's boxes; attributes and classes as indices, texts as lists."""
     if not isinstance(boxes, list) or not all(isinstance(box, dict) for box in boxes):
         raise FormatError(f"{path}: sample {token} must hold a list of boxes")
     if len(boxes) > max_boxes:
@@ -120,7 +173,7 @@ def _read_sample(path: Path, token: str, boxes: Any, max_boxes: int) -> dict[str
         )
     arrays: dict[str, Any] = {}
     try:
-        for key, shape in _NUMBERS.items():
+        for key, shape in form.numbers.items():
             try:
                 array = np.array([box[key] for box in boxes], dtype=np.float64)
             except (TypeError, ValueError, OverflowError):
@@ -129,14 +182,20 @@ def _read_sample(path: Path, token: str, boxes: Any, max_boxes: int) -> dict[str
                 expected = f"{shape[0]} numbers" if shape else "a number"
                 raise FormatError(f"{path}: {key} of a box of sample {token} must be {expected}")
             arrays[key] = array.reshape(len(boxes), *shape)
-        for key, index in _NAMES.items():
+        for key, index in form.names.items():
             arrays[key] = np.array([index.get(box[key], _UNKNOWN) for box in boxes], dtype=np.int64)
             if (arrays[key] == _UNKNOWN).any():
                 name = boxes[int(np.argmax(arrays[key] == _UNKNOWN))][key]
                 known = ", ".join(filter(None, index))
                 raise FormatError(f"{path}: sample {token} holds a box of unknown {key} {name!r}; known are {known}")
+        for key in form.texts:
+            if not all(isinstance(box[key], str | int) and box[key] != "" for box in boxes):
+                raise FormatError(f"{path}: {key} of a box of sample {token} must be text or a whole number")
+            arrays[key] = [str(box[key]) for box in boxes]
     except KeyError as error:
-        raise FormatError(f"{path}: a box of sample {token} has no {error.args[0]!r}") from None
+        other = "detection_name" if form is _TRACKS else "tracking_name"
+        hint = f": it has {other!r}, so this is another kind of file" if any(other in box for box in boxes) else ""
+        raise FormatError(f"{path}: a box of sample {token} has no {error.args[0]!r}{hint}") from None
     except TypeError:
         raise FormatError(f"{path}: {key} of a box of sample {token} must be text") from None
     if any(box.get("sample_token", token) != token for box in boxes):
@@ -144,24 +203,25 @@ def _read_sample(path: Path, token: str, boxes: Any, max_boxes: int) -> dict[str
     return arrays
 
 
-def _join(path: Path, tokens: list[str], parts: list[dict[str, Any]]) -> GlobalBoxes:
+def _join(path: Path, tokens: list[str], parts: list[dict[str, Any]], form: _Form) -> GlobalBoxes:
     """The samples' arrays joined, with their values checked."""
-    samples = np.repeat(np.arange(len(parts)), [len(part["detection_score"]) for part in parts])
+    samples = np.repeat(np.arange(len(parts)), [len(part["translation"]) for part in parts])
     joined: dict[str, Any] = {
-        key: np.concatenate([part[key] for part in parts] + [np.zeros((0, *shape))]) for key, shape in _NUMBERS.items()
+        key: np.concatenate([part[key] for part in parts] + [np.zeros((0, *shape))])
+        for key, shape in form.numbers.items()
     }
     # a velocity may be unknown (NaN); nothing else may
-    checks = [(f"{key} that is NaN or infinite", _not_finite(joined[key])) for key in _NUMBERS if key != "velocity"]
+    checks = [(f"{key} that is NaN or infinite", _not_finite(joined[key])) for key in form.numbers if key != "velocity"]
     checks.append(("size that is not positive", (joined["size"] <= 0).any(axis=1)))
     checks.append(("rotation that is zero", (joined["rotation"] == 0).all(axis=1)))
     for what, bad in checks:
         if bad.any():
             token = tokens[samples[np.argmax(bad)]]
             raise FormatError(f"{path}: {int(bad.sum())} boxes, the first of sample {token}, have a {what}")
-    labels, attributes = (
-        np.concatenate([part[key] for part in parts] + [np.zeros(0, np.int64)])
-        for key in ("detection_name", "attribute_name")
-    )
+    names = {key: np.concatenate([part[key] for part in parts] + [np.zeros(0, np.int64)]) for key in form.names}
+    labels = names.get("detection_name", names.get("tracking_name"))
+    assert labels is not None
+    none = np.full(len(samples), -1, dtype=np.int64)
     return GlobalBoxes(
         tuple(tokens),
         samples.astype(np.int64),
@@ -170,9 +230,9 @@ def _join(path: Path, tokens: list[str], parts: list[dict[str, Any]]) -> GlobalB
         joined["rotation"],
         joined["velocity"],
         labels,
-        joined["detection_score"],
-        attributes,
-        np.full(len(samples), -1, dtype=np.int64),
+        joined["detection_score" if "detection_score" in joined else "tracking_score"],
+        names.get("attribute_name", none),
+        none,
     )
 
 

@@ -11,12 +11,9 @@ import numpy as np
 
 from lcf3d.errors import FormatError
 from lcf3d.files import write_text
-from lcf3d.formats.nuscenes import MAX_BOXES_PER_SAMPLE
+from lcf3d.formats.nuscenes import MAX_BOXES_PER_SAMPLE, TRACKING_CLASSES
 from lcf3d.formats.nuscenes_boxes import global_from_detections
 from lcf3d.structures import Detections3D, FloatArray, IntArray
-
-TRACKING_CLASSES = ("bicycle", "bus", "car", "motorcycle", "pedestrian", "trailer", "truck")
-"""The classes that the nuScenes tracking benchmark knows; boxes of others are left out."""
 
 _META = {"use_camera": True, "use_lidar": True, "use_radar": False, "use_map": False, "use_external": False}
 
@@ -30,6 +27,8 @@ def write_tracking(
     sample_tokens: Sequence[str],
 ) -> None:
     """Write tracked boxes as a tracking submission, the highest scores first, at most 500 a sample.
+
+    Boxes of classes that the tracking benchmark does not know are left out.
 
     Args:
         path: the file, written whole or not at all.

@@ -13,7 +13,7 @@ from lcf3d.geometry.boxes import HEIGHT, LENGTH, YAW, Z
 from lcf3d.structures import Camera, FloatArray, IntArray
 
 # columns of `Tracks.numbers` and `Tracks.values`
-ID, LABEL, HITS = range(3)
+ID, LABEL, HITS, NUMBER_HITS = range(4)
 (
     POSITION_X,
     POSITION_Y,
@@ -50,7 +50,8 @@ class Tracks:
     Two tables, so that a step is a few calls whatever the number of tracks; the columns have names of their own.
 
     Attributes:
-        numbers: (T, 3) id, never used again within a sequence; class; number of frames that saw the object.
+        numbers: (T, 4) id, never used again within a sequence; class; number of frames that saw the object; number of
+            frames that saw what goes by the id, which tracks may exchange (`memory_identity`).
         values: (T, 25): position and velocity if the object moves, and what the properties below name; last, position
             and variance if it stands, and how probable that is.
     """
@@ -61,7 +62,7 @@ class Tracks:
     @classmethod
     def empty(cls) -> Tracks:
         """No tracks."""
-        return cls(np.zeros((0, 3), dtype=np.int64), np.zeros((0, 25)))
+        return cls(np.zeros((0, 4), dtype=np.int64), np.zeros((0, 25)))
 
     def __len__(self) -> int:
         return len(self.numbers)
@@ -84,6 +85,11 @@ class Tracks:
     def hits(self) -> IntArray:
         """(T,) number of frames that saw the object."""
         return self.numbers[:, HITS]
+
+    @property
+    def number_hits(self) -> IntArray:
+        """(T,) number of frames that saw what goes by the track's id."""
+        return self.numbers[:, NUMBER_HITS]
 
     @property
     def positions(self) -> FloatArray:
@@ -141,7 +147,7 @@ class Tracks:
 
     @property
     def born(self) -> FloatArray:
-        """(T,) time of the first frame that saw the object."""
+        """(T,) time of the first frame that saw what goes by the track's id."""
         return self.values[:, BORN]
 
     @property

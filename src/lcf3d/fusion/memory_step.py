@@ -13,6 +13,7 @@ from lcf3d.fusion.memory_association import associate
 from lcf3d.fusion.memory_config import MemoryConfig
 from lcf3d.fusion.memory_ego import learned_odometry
 from lcf3d.fusion.memory_evidence import CAMERA, HIDDEN, frame_support, missed_log_odds, seen_log_odds
+from lcf3d.fusion.memory_identity import keep_numbers
 from lcf3d.fusion.memory_motion import begin, measure, predict
 from lcf3d.fusion.memory_prediction import free_camera_scores, free_share, hidden_share, seen_by, views_of
 from lcf3d.fusion.memory_shape import bottom_share, refine, reshape, size_weight
@@ -23,6 +24,7 @@ from lcf3d.fusion.memory_state import (
     ID,
     LABEL,
     LAST_SUPPORT,
+    NUMBER_HITS,
     SEEN,
     SIZE,
     SIZE_WEIGHT,
@@ -100,6 +102,7 @@ def step(memory: Memory, tracks: Tracks, fused: FusedDetections, moment: Moment)
         seen.log_odds, support, _looked(memory, seen, elapsed), classes.seen_weight[found.labels], elapsed
     )
     known, own = _updated(tracks, seen, found, memory, time)
+    known = keep_numbers(known, len(tracks), own, boxes, classes.rigid[found.labels])
     places = known.boxes
     # what is seen is made better by where it is if it moves: what stands and starts would be held back
     places[own, :2] = known.moving_positions[own]
@@ -166,7 +169,7 @@ def _updated(tracks: Tracks, seen: _Seen, found: Detections3D, memory: Memory, t
     own = seen.match.copy()
     own[new] = len(tracks) + np.arange(n_new)
     values = np.empty((len(tracks) + n_new, tracks.values.shape[1]))
-    numbers = np.empty((len(values), 3), dtype=np.int64)
+    numbers = np.empty((len(values), 4), dtype=np.int64)
     values[: len(tracks)], numbers[: len(tracks)] = tracks.values, tracks.numbers
     shares = np.zeros(len(found))
     shares[old] = bottom_share(time - tracks.seen[seen.match[old]])
@@ -194,7 +197,8 @@ def _update(to, seen, by):  # type: ignore[no-untyped-def]
             numbers[row, HITS] += 1
         else:
             begin(track, boxes[i], distances[i], speed_spread[label])
-            numbers[row, ID], numbers[row, LABEL], numbers[row, HITS] = next_id + row - n_old, label, 1
+            numbers[row, ID], numbers[row, LABEL] = next_id + row - n_old, label
+            numbers[row, HITS], numbers[row, NUMBER_HITS] = 1, 0
             track[SIZE : SIZE + 3] = boxes[i, 3:6]
             track[SIZE_WEIGHT], track[BOTTOM] = weights[i], boxes[i, 2] - boxes[i, 5] / 2
             track[SUPPORT], track[BORN] = 0.0, time
@@ -289,7 +293,7 @@ def _assemble(
     table = TrackTable(
         ids=tracks.ids,
         ages_s=time - tracks.born,
-        hits=tracks.hits,
+        hits=tracks.number_hits,
         unseen_s=time - tracks.seen,
         support=tracks.support,
         log_odds=np.concatenate([own - alone, extra])[order],
