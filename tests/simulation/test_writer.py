@@ -43,7 +43,7 @@ def kitti(tmp_path_factory):
 
 def test_the_kitti_reader_finds_what_was_simulated(kitti, tiny_presets):
     dataset = KittiDataset(kitti, image_size=(248, 75))
-    assert dataset.ids == tuple(f"{k:06d}" for k in range(5))
+    assert dataset.ids == tuple(f"0000_{k:06d}" for k in range(5))
     for index in (0, 4):
         frame = dataset[index]
         expected = next(simulate_drive("kitti64", 1, 5, street="residential", first=index))
@@ -54,11 +54,20 @@ def test_the_kitti_reader_finds_what_was_simulated(kitti, tiny_presets):
             np.testing.assert_allclose(mine.pixels_from_lidar, theirs.pixels_from_lidar, atol=1e-6)
 
 
+def test_a_drive_tells_when_and_from_where_it_was_seen(kitti, tiny_presets):
+    frames = list(KittiDataset(kitti, image_size=(248, 75)))
+    assert [(frame.sequence, round(frame.timestamp, 6)) for frame in frames] == [("0000", k / 10) for k in range(5)]
+    expected = [frame.world_from_lidar for frame in simulate_drive("kitti64", 1, 5, street="residential", images=False)]
+    first_from_last = np.linalg.inv(frames[0].world_from_lidar) @ frames[4].world_from_lidar
+    np.testing.assert_allclose(first_from_last, np.linalg.inv(expected[0]) @ expected[4], atol=1e-6)
+    assert np.linalg.norm(first_from_last[:3, 3]) > 0.5
+
+
 def test_instance_ids_and_tracks_belong_to_the_label_lines(kitti):
     for k in range(5):
-        objects = read_objects(kitti / "training" / "label_2" / f"{k:06d}.txt", results=False)
-        tracks = [int(t) for t in (kitti / "training" / "tracks" / f"{k:06d}.txt").read_text().split()]
-        ids = np.array(Image.open(kitti / "training" / "instance_2" / f"{k:06d}.png"))
+        objects = read_objects(kitti / "training" / "label_2" / f"0000_{k:06d}.txt", results=False)
+        tracks = [int(t) for t in (kitti / "training" / "tracks" / f"0000_{k:06d}.txt").read_text().split()]
+        ids = np.array(Image.open(kitti / "training" / "instance_2" / f"0000_{k:06d}.png"))
         assert ids.dtype == np.uint16
         assert len(tracks) == len(objects)
         for track, box in zip(tracks, objects.boxes2d, strict=True):
@@ -70,8 +79,8 @@ def test_instance_ids_and_tracks_belong_to_the_label_lines(kitti):
 
 def test_the_splits_share_no_frame(kitti):
     train, val = ((kitti / "ImageSets" / f"{s}.txt").read_text().split() for s in ("train", "val"))
-    assert sorted(train + val) == [f"{k:06d}" for k in range(5)]
-    assert val == ["000004"]
+    assert sorted(train + val) == [f"0000_{k:06d}" for k in range(5)]
+    assert val == ["0000_000004"]
 
 
 def test_whole_drives_belong_to_one_split(tmp_path):
@@ -210,6 +219,7 @@ def test_long_sequences_are_cut_into_drives():
     assert recipe.place(85) == (2, 5)
     assert recipe.frames_of(2) == 10
     assert recipe.id(85) == "0002_0005"
+    assert Recipe("kitti64", 90, sequence=True).id(85) == "0002_000005"
     assert Recipe("kitti64", 3).id(2) == "000002"
 
 

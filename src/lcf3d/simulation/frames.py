@@ -372,8 +372,22 @@ def simulate_drive(
     if seed < 0 or drive < 0:
         raise ConfigError(f"seed and number must not be negative, got {seed} and {drive}")
     sensors = get_preset(preset) if isinstance(preset, str) else preset
-    duration = (frames - 1) / sensors.rate_hz
-    scene = build_scene(np.random.default_rng([seed, drive]), sensors.layout, duration, street, density, sensors.world)
+    scene = _drive_scene(sensors, seed, frames, drive, street, density)
     for number in range(first, frames):
         name = f"{drive:06d}" if frames == 1 else f"{drive:04d}_{number:06d}"
         yield capture(scene, sensors, number / sensors.rate_hz, (seed, drive, number), name, images, threads)
+
+
+def drive_poses(
+    preset: str, seed: int, frames: int, drive: int = 0, street: str | None = None, density: float = 1.0
+) -> FloatArray:
+    """(frames, 4, 4) world from LiDAR of the frames that `simulate_drive` gives, without simulating them."""
+    sensors = get_preset(preset)
+    scene = _drive_scene(sensors, seed, frames, drive, street, density)
+    return np.array([sensor_pose(scene, sensors, number / sensors.rate_hz) for number in range(frames)])
+
+
+def _drive_scene(sensors: Preset, seed: int, frames: int, drive: int, street: str | None, density: float) -> Scene:
+    """The scene that a drive goes through."""
+    duration = (frames - 1) / sensors.rate_hz
+    return build_scene(np.random.default_rng([seed, drive]), sensors.layout, duration, street, density, sensors.world)

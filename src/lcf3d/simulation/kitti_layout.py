@@ -11,9 +11,11 @@ from numpy.typing import NDArray
 
 from lcf3d.files import atomic_path, write_text
 from lcf3d.formats.kitti import write_objects
+from lcf3d.geometry.rotation import invert_rigid
 from lcf3d.simulation.frames import SimulatedFrame
 from lcf3d.simulation.labels import label_order
 from lcf3d.simulation.presets import KITTI_FOCAL, Preset, kitti_calibration
+from lcf3d.structures import FloatArray
 
 IMAGE_FOLDERS: Final = {"left": "image_2", "right": "image_3"}
 VAL_EVERY: Final = 5
@@ -82,6 +84,15 @@ def calibration_text(preset: Preset) -> str:
     entries = {n: scale @ m if n.startswith("P") else m for n, m in kitti_calibration().items()}
     lines = [f"{name}: " + " ".join(f"{v:.12e}" for v in matrix.ravel()) for name, matrix in entries.items()]
     return "\n".join(lines) + "\n"
+
+
+def write_poses(root: Path, drive: str, world_from_lidar: FloatArray, preset: Preset) -> None:
+    """Write ``poses/DRIVE.txt``: first camera from the left camera of each of the (F, 4, 4) poses of the LiDAR."""
+    camera_from_lidar = preset.cameras[0].camera_from_lidar
+    world_from_camera = world_from_lidar @ invert_rigid(camera_from_lidar)
+    poses = invert_rigid(world_from_camera[0]) @ world_from_camera
+    rows = (" ".join(f"{value:.9e}" for value in pose[:3].ravel()) for pose in poses)
+    write_text(root / "poses" / f"{drive}.txt", "".join(f"{row}\n" for row in rows))
 
 
 def write_splits(root: Path, ids: Sequence[str], frames_per_drive: int) -> None:

@@ -15,7 +15,7 @@ from lcf3d.errors import ConfigError, DatasetError, MissingExtraError
 from lcf3d.files import list_files, read_json, remove_left_overs, write_json
 from lcf3d.processes import end_with_parent, lock_folder, unlock_folder, workers
 from lcf3d.simulation import kitti_layout, nuscenes_layout
-from lcf3d.simulation.frames import simulate_drive
+from lcf3d.simulation.frames import drive_poses, simulate_drive
 from lcf3d.simulation.presets import get_preset
 from lcf3d.simulation.streets import STREET_NAMES
 
@@ -67,10 +67,11 @@ class Recipe:
 
     def id(self, index: int) -> str:
         """File name stem of a frame."""
-        if get_preset(self.preset).layout == "kitti":
+        kitti = get_preset(self.preset).layout == "kitti"
+        if kitti and not self.sequence:
             return f"{index:06d}"
         drive, number = self.place(index)
-        return f"{drive:04d}_{number:04d}"
+        return f"{drive:04d}_{number:06d}" if kitti else f"{drive:04d}_{number:04d}"
 
 
 def write_dataset(
@@ -120,11 +121,22 @@ def _write(recipe: Recipe, root: Path, jobs: int, progress: Callable[[int], None
     try:
         if layout is kitti_layout:
             kitti_layout.write_splits(root, ids, recipe.drive_frames)
+            _write_poses(recipe, root)
         else:
             nuscenes_layout.write_tables(root, ids, recipe.seed)
     except OSError as error:
         raise _write_error(root, error) from error
     return ids
+
+
+def _write_poses(recipe: Recipe, root: Path) -> None:
+    """Write where the camera of each drive was, as KITTI's odometry does, for what looks at more than one frame."""
+    if not recipe.sequence:
+        return
+    for drive in range(recipe.place(recipe.frames - 1)[0] + 1):
+        frames = recipe.frames_of(drive)
+        poses = drive_poses(recipe.preset, recipe.seed, frames, drive, recipe.street, recipe.density)
+        kitti_layout.write_poses(root, f"{drive:04d}", poses, get_preset(recipe.preset))
 
 
 def _layout(recipe: Recipe) -> ModuleType:
