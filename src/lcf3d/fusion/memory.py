@@ -76,6 +76,7 @@ def remember(
             tracks=Tracks.empty(),
             time_s=frame.timestamp,
             world_from_lidar=np.eye(4),
+            lidar_from_world=np.eye(4),
             world_from_dataset=None if frame.world_from_lidar is None else invert_rigid(frame.world_from_lidar),
             odometry=FIRST_ODOMETRY,
             ego_velocity=None,
@@ -135,7 +136,7 @@ def _discontinuity(memory: Memory, frame: Frame, config: MemoryConfig) -> str | 
     pose = _given_pose(memory, frame)
     if pose is None:
         return None
-    moved = (invert_rigid(memory.world_from_lidar) @ pose).tolist()
+    moved = (memory.lidar_from_world @ pose).tolist()
     speed = math.hypot(moved[0][3], moved[1][3], moved[2][3]) / elapsed
     cosine = (moved[0][0] + moved[1][1] + moved[2][2] - 1) / 2
     turn = math.acos(min(max(cosine, -1.0), 1.0)) / elapsed

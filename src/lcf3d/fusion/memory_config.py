@@ -25,6 +25,9 @@ class ClassMemory(BaseModel):
         acceleration: standard deviation of accelerations, m/s^2.
         turns: whether it moves along its heading.
         rigid: whether sizes, heights and positions are made better along the track; people change shape as they walk.
+        upright: whether heights of what is not rigid are; people keep theirs.
+        standing_doubt: how much more false alarms stand than objects do, 0 to 1: what is taken for a person and moves
+            is one, a pole stands.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -36,16 +39,20 @@ class ClassMemory(BaseModel):
     acceleration: Positive = 3.0
     turns: bool = True
     rigid: bool = True
+    upright: bool = True
+    standing_doubt: float = Field(default=0.0, ge=0, lt=1)
 
 
 VEHICLE = ClassMemory(seen_weight=0.1, missed_weight=0.15, speed_spread=6.0, acceleration=5.0)
-RIDER = ClassMemory(seen_weight=0.4)
-PERSON = ClassMemory(speed_spread=1.5, acceleration=1.5, turns=False, rigid=False)
+RIDER = ClassMemory(seen_weight=0.4, missed_weight=0.4, standing_doubt=0.6)
+BICYCLE = RIDER.model_copy(update={"standing_doubt": 0.0})  # parked ones are objects too
+PERSON = ClassMemory(speed_spread=1.5, acceleration=1.5, turns=False, rigid=False, standing_doubt=0.6)
 FIXTURE = ClassMemory(speed_spread=0.3, acceleration=0.1, turns=False)
 
 _KINDS = (
     (VEHICLE, ("car", "van", "truck", "bus", "tram", "trailer", "construction_vehicle", "vehicle")),
-    (RIDER, ("cyclist", "bicycle", "motorcycle", "bicyclist", "motorcyclist")),
+    (RIDER, ("cyclist", "bicyclist", "motorcyclist")),
+    (BICYCLE, ("bicycle", "motorcycle")),
     (PERSON, ("pedestrian", "person", "person_sitting")),
     (FIXTURE, ("traffic_cone", "barrier", "sign")),
 )
@@ -73,6 +80,8 @@ class ClassColumns(NamedTuple):
     missed_weight: FloatArray
     base: FloatArray
     rigid: BoolArray
+    upright: BoolArray
+    standing_doubt: FloatArray
     motion: Motion
 
 
@@ -123,5 +132,7 @@ class MemoryConfig(BaseModel):
             np.array([c.missed_weight for c in every]),
             np.array([c.base for c in every]),
             np.array([c.rigid for c in every], dtype=bool),
+            np.array([c.upright for c in every], dtype=bool),
+            np.array([c.standing_doubt for c in every]),
             motion,
         )

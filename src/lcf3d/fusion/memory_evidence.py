@@ -79,3 +79,15 @@ def missed_log_odds(
         bases: (N,) of the classes.
     """
     return np.asarray(weights * support + HIDDEN * hidden + CAMERA * camera - REFUTED * free - bases)
+
+
+def motion_log_odds(standing: FloatArray, doubt: FloatArray) -> FloatArray:
+    """(N,) log-odds that the way an object moves adds: 0 while nothing is known of it.
+
+    Of objects half stand, of false alarms ``(1 + doubt) / 2``: poles and bushes that are taken for people stand still.
+
+    Args:
+        standing: (N,) probability that it stands.
+        doubt: (N,) of the classes, 0 to 1; 0 where false alarms move as objects do.
+    """
+    return np.asarray(-np.log1p(doubt * (2 * standing - 1)))

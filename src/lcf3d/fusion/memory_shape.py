@@ -8,27 +8,82 @@ from __future__ import annotations
 
 import numpy as np
 
-from lcf3d.fusion.memory_state import BOTTOM, SIZE, SIZE_WEIGHT
+from lcf3d.fusion.memory_state import (
+    BOTTOM,
+    HEADING,
+    POSITION_X,
+    POSITION_Y,
+    SIZE,
+    SIZE_H,
+    SIZE_WEIGHT,
+    STANDING,
+    STANDING_X,
+    STANDING_Y,
+    Tracks,
+)
 from lcf3d.kernels import kernel
-from lcf3d.structures import FloatArray
+from lcf3d.structures import FloatArray, IntArray
 
 # the past counts at most so many times what the present does in a size
 MAX_PAST = 3.0
-# share of the track in the height of the bottom a tenth of a second after it was last seen
-BOTTOM_SHARE = 0.5
+# measured sizes count 1 / e as much at this distance: from nearby more of an object is seen
+SIZE_DISTANCE = 10.0
+# share of the track in the height of the bottom a tenth of a second after it was last seen, at the sensor and far away
+BOTTOM_SHARE, FAR_BOTTOM_SHARE, FAR = 0.5, 0.7, 60.0
 BOTTOM_UNIT_S = 0.1
 # share of the filter's correction that a position takes; the detector errs alike from frame to frame
 POSITION_SHARE = 0.5
+# share of the model that stands in that position, for what surely stands
+STANDING_SHARE = 0.25
 
 
-def size_weight(log_odds: FloatArray) -> FloatArray:
-    """(N,) how much measured sizes count, by the detections' log-odds; sure ones count more."""
-    return np.exp(np.minimum(np.maximum(log_odds, -6.0), 6.0) / 2)
+def size_weight(log_odds: FloatArray, distances: FloatArray) -> FloatArray:
+    """(N,) how much measured sizes count, by the detections' log-odds and distances: sure and near ones count more."""
+    return np.asarray(np.exp(np.minimum(np.maximum(log_odds, -6.0), 6.0) / 2 - distances / SIZE_DISTANCE))
 
 
-def bottom_share(unseen_s: FloatArray) -> FloatArray:
-    """(N,) share of the track in the height of the bottom; a track unseen for long counts less."""
-    return np.asarray(BOTTOM_SHARE ** np.maximum(unseen_s / BOTTOM_UNIT_S, 1.0))
+def bottom_share(unseen_s: FloatArray, distances: FloatArray) -> FloatArray:
+    """(N,) share of the track in the height of the bottom; a track unseen for long counts less, a far one more."""
+    share = BOTTOM_SHARE + (FAR_BOTTOM_SHARE - BOTTOM_SHARE) * np.minimum(distances / FAR, 1.0)
+    return np.asarray(share ** np.maximum(unseen_s / BOTTOM_UNIT_S, 1.0))
+
+
+def boxes_now(tracks: Tracks, own: IntArray, measured: FloatArray, share: float) -> FloatArray:
+    """(T, 7) boxes of tracks in the world frame.
+
+    What is not seen is where it is if it stands or if it moves, whichever is more probable. What is seen is where it is
+    if it moves, drawn to where it is if it stands: else what stands and starts would be held back.
+
+    Args:
+        tracks: T of them, with what the frame saw.
+        own: (N,) the tracks that are seen.
+        measured: (N, 7) their measured boxes.
+        share: of the way from the measured position to the track's that they go.
+    """
+    boxes = np.empty((len(tracks), 7))
+    _fill_boxes(tracks.values, own, measured, share, boxes)
+    return boxes
+
+
+@kernel
+def _fill_boxes(values, own, measured, share, boxes):  # type: ignore[no-untyped-def]
+    """Fill ``boxes``, see `boxes_now`."""
+    for i in range(len(values)):
+        track = values[i]
+        if track[STANDING] > 0.5:
+            boxes[i, 0], boxes[i, 1] = track[STANDING_X], track[STANDING_Y]
+        else:
+            boxes[i, 0], boxes[i, 1] = track[POSITION_X], track[POSITION_Y]
+        boxes[i, 2] = track[BOTTOM] + track[SIZE_H] / 2
+        boxes[i, 3:6] = track[SIZE : SIZE + 3]
+        boxes[i, 6] = track[HEADING]
+    for k in range(len(own)):
+        i, track = own[k], values[own[k]]
+        p = STANDING_SHARE * track[STANDING]
+        x = track[POSITION_X] + p * (track[STANDING_X] - track[POSITION_X])
+        y = track[POSITION_Y] + p * (track[STANDING_Y] - track[POSITION_Y])
+        boxes[i, 0] = x if share == 1 else x + (1 - share) * (measured[k, 0] - x)
+        boxes[i, 1] = y if share == 1 else y + (1 - share) * (measured[k, 1] - y)
 
 
 @kernel
@@ -51,7 +106,7 @@ def reshape(track, box, weight, bottom_share):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def refine(boxes, match, rigid, tracked, refined):  # type: ignore[no-untyped-def]
+def refine(boxes, match, rigid, upright, tracked, refined):  # type: ignore[no-untyped-def]
     """Fill ``refined`` (N, 7) with detections made better by their tracks (numba).
 
     Sizes and height are the track's; the side facing the sensor stays, then the position is drawn to the track's.
@@ -59,15 +114,21 @@ def refine(boxes, match, rigid, tracked, refined):  # type: ignore[no-untyped-de
     Args:
         boxes: (N, 7) measured, in the LiDAR frame.
         match: (N,) track, or -1.
-        rigid: (N,) whether the object is; others keep their box.
+        rigid: (N,) whether the object is.
+        upright: (N,) whether at least its height is the track's, on the measured bottom; others keep their box.
         tracked: (T, 7) boxes of the tracks in the LiDAR frame.
         refined: (N, 7) to fill.
     """
     for i in range(len(boxes)):
         refined[i] = boxes[i]
-        if match[i] < 0 or not rigid[i]:
+        if match[i] < 0:
             continue
         box, own = boxes[i], tracked[match[i]]
+        if not rigid[i]:
+            if not upright[i]:
+                continue
+            refined[i, 2], refined[i, 5] = box[2] + (own[5] - box[5]) / 2, own[5]
+            continue
         cos, sin = np.cos(box[6]), np.sin(box[6])
         # the sensor seen from the box, in half lengths and widths: beyond +-1 it is in front of that face
         ahead = -(box[0] * cos + box[1] * sin) / (box[3] / 2)

@@ -48,13 +48,20 @@ def smooth_sequence(
         )
         for (frame, _), pose in zip(frames, poses, strict=True)
     ]
-    backward, _ = _run(turned[::-1], [fused for _, fused in frames][::-1], settings)
+    backward, _ = _run(turned[::-1], [fused for _, fused in frames][::-1], _without_motion(settings, frames))
     backward = backward[::-1]
     forward_id = _forward_ids(forward, backward)
     return [
         fused if ahead.tracks is None or back.tracks is None else _joined(fused, ahead, back, forward_id, settings)
         for (_, fused), ahead, back in zip(frames, forward, backward, strict=True)
     ]
+
+
+def _without_motion(config: MemoryConfig, frames: Sequence[tuple[Frame, FusedDetections]]) -> MemoryConfig:
+    """The same, but how an object moves says nothing: it is one piece of evidence, and the other direction has it."""
+    names = dict.fromkeys(name for _, fused in frames for name in fused.detections.class_names)
+    classes = {name: config.of(name).model_copy(update={"standing_doubt": 0.0}) for name in names}
+    return config.model_copy(update={"classes": {**config.classes, **classes}})
 
 
 def _run(

@@ -9,7 +9,6 @@ import numpy as np
 
 from lcf3d.frame import Frame
 from lcf3d.fusion.memory_config import ClassColumns, MemoryConfig
-from lcf3d.geometry.boxes import HEIGHT, LENGTH, YAW, Z
 from lcf3d.structures import Camera, FloatArray, IntArray
 
 # columns of `Tracks.numbers` and `Tracks.values`
@@ -155,16 +154,6 @@ class Tracks:
         """(T,) time of the last."""
         return self.values[:, SEEN]
 
-    @property
-    def boxes(self) -> FloatArray:
-        """(T, 7) canonical boxes in the world frame."""
-        boxes = np.empty((len(self), 7))
-        boxes[:, :2] = self.positions
-        boxes[:, Z] = self.bottoms + self.sizes[:, 2] / 2
-        boxes[:, LENGTH : HEIGHT + 1] = self.sizes
-        boxes[:, YAW] = self.yaws
-        return boxes
-
 
 class Odometry(NamedTuple):
     """How long the poses' steps really are.
@@ -187,6 +176,7 @@ class Memory:
         time_s: when the last frame was.
         world_from_lidar: (4, 4) where the sensor was then. The memory's world is the LiDAR frame of its first frame,
             so that z is up whatever the axes of the dataset's world.
+        lidar_from_world: its inverse.
         world_from_dataset: (4, 4) from the fixed frame of the dataset's poses; None where it has none. It moves
             along as the scale of the poses' steps is corrected.
         odometry: what is known of that scale.
@@ -203,6 +193,7 @@ class Memory:
     tracks: Tracks
     time_s: float
     world_from_lidar: FloatArray
+    lidar_from_world: FloatArray
     world_from_dataset: FloatArray | None
     odometry: Odometry
     ego_velocity: FloatArray | None
@@ -236,3 +227,8 @@ class Moment(NamedTuple):
     world_from_lidar: FloatArray
     ego_velocity: FloatArray | None
     cameras: tuple[Camera, ...]
+
+    @property
+    def estimated(self) -> bool:
+        """Whether the place was estimated from the objects."""
+        return self.ego_velocity is not None

@@ -12,11 +12,18 @@ from lcf3d.fusion.evidence import to_log_odds, to_probability
 from lcf3d.fusion.memory_association import associate
 from lcf3d.fusion.memory_config import MemoryConfig
 from lcf3d.fusion.memory_ego import learned_odometry
-from lcf3d.fusion.memory_evidence import CAMERA, HIDDEN, frame_support, missed_log_odds, seen_log_odds
+from lcf3d.fusion.memory_evidence import (
+    CAMERA,
+    HIDDEN,
+    frame_support,
+    missed_log_odds,
+    motion_log_odds,
+    seen_log_odds,
+)
 from lcf3d.fusion.memory_identity import keep_numbers
 from lcf3d.fusion.memory_motion import begin, measure, predict
 from lcf3d.fusion.memory_prediction import free_camera_scores, free_share, hidden_share, seen_by, views_of
-from lcf3d.fusion.memory_shape import bottom_share, refine, reshape, size_weight
+from lcf3d.fusion.memory_shape import bottom_share, boxes_now, refine, reshape, size_weight
 from lcf3d.fusion.memory_state import (
     BORN,
     BOTTOM,
@@ -41,11 +48,13 @@ from lcf3d.kernels import kernel
 from lcf3d.provenance import FusedDetections
 from lcf3d.structures import BoolArray, Detections3D, FloatArray, IntArray
 
-# a predicted box overlaps no detection in the bird's-eye view by more than this
+# a predicted box overlaps no detection of its class, and none of another that is as sure, by more than this from above
 DUPLICATE_IOU = 0.1
 # a detection and its track's predicted position are at most so far apart: metres, and standard deviations of speed
 # for the time between, but no more metres than
 REACH_M, REACH_SPREADS, MAX_REACH_M = 0.7, 4.0, 10.0
+# share of what the track says of places and heights where the sensor's own motion is estimated, without its pitch
+ESTIMATED_SHARE = 0.5
 # boxes of log-odds below this hide nothing
 SURE_LOG_ODDS = -1.0
 
@@ -101,14 +110,14 @@ def step(memory: Memory, tracks: Tracks, fused: FusedDetections, moment: Moment)
     log_odds = seen_log_odds(
         seen.log_odds, support, _looked(memory, seen, elapsed), classes.seen_weight[found.labels], elapsed
     )
-    known, own = _updated(tracks, seen, found, memory, time)
+    known, own = _updated(tracks, seen, found, memory, moment)
     known = keep_numbers(known, len(tracks), own, boxes, classes.rigid[found.labels])
-    places = known.boxes
-    # what is seen is made better by where it is if it moves: what stands and starts would be held back
-    places[own, :2] = known.moving_positions[own]
+    log_odds += motion_log_odds(known.standing[own], classes.standing_doubt[found.labels])
+    places = boxes_now(known, own, boxes, ESTIMATED_SHARE if moment.estimated else 1.0)
     tracked = transform_boxes(places, lidar_from_world)
     kept = np.empty((len(found), 7))
-    refine(np.array(found.boxes), match, classes.rigid[found.labels], tracked, kept)
+    shaped = classes.rigid[found.labels], classes.upright[found.labels]
+    refine(np.array(found.boxes), match, *shaped, tracked, kept)
     predicted = _predicted(len(tracks), known, tracked, seen, fused, moment, memory)
     extra = tracked[predicted.rows]
     result = _assemble(
@@ -125,6 +134,7 @@ def step(memory: Memory, tracks: Tracks, fused: FusedDetections, moment: Moment)
         tracks=_bounded(known, time, memory.config),
         time_s=time,
         world_from_lidar=moment.world_from_lidar,
+        lidar_from_world=lidar_from_world,
         world_from_dataset=world_from_dataset,
         odometry=odometry,
         ego_velocity=moment.ego_velocity,
@@ -157,12 +167,14 @@ def _looked(memory: Memory, seen: _Seen, elapsed_s: float) -> BoolArray:
     new = np.flatnonzero(seen.match < 0)
     looked = np.zeros(len(seen.match), dtype=bool)
     if elapsed_s > 0 and len(new):
-        before = transform_boxes(seen.boxes[new], invert_rigid(memory.world_from_lidar))
+        before = transform_boxes(seen.boxes[new], memory.lidar_from_world)
         looked[new] = seen_by(views_of(before, memory.cameras), len(new))
     return looked
 
 
-def _updated(tracks: Tracks, seen: _Seen, found: Detections3D, memory: Memory, time: float) -> tuple[Tracks, IntArray]:
+def _updated(
+    tracks: Tracks, seen: _Seen, found: Detections3D, memory: Memory, moment: Moment
+) -> tuple[Tracks, IntArray]:
     """The tracks with what the frame saw of them, and then those that begin; and (N,) the row of each detection's."""
     old, new = seen.match >= 0, seen.match < 0
     n_new = int(new.sum())
@@ -172,12 +184,15 @@ def _updated(tracks: Tracks, seen: _Seen, found: Detections3D, memory: Memory, t
     numbers = np.empty((len(values), 4), dtype=np.int64)
     values[: len(tracks)], numbers[: len(tracks)] = tracks.values, tracks.numbers
     shares = np.zeros(len(found))
-    shares[old] = bottom_share(time - tracks.seen[seen.match[old]])
+    time = moment.time_s
+    shares[old] = bottom_share(time - tracks.seen[seen.match[old]], seen.distances[old])
+    if moment.estimated:
+        shares *= ESTIMATED_SHARE
     motion = memory.classes.motion
     _update(
         (numbers, values, own, len(tracks), memory.next_id, time),
         (seen.boxes, np.array(found.labels), seen.distances, frame_support(seen.log_odds)),
-        (size_weight(seen.log_odds), shares, motion.turns, motion.speed_spread),
+        (size_weight(seen.log_odds, seen.distances), shares, motion.turns, motion.speed_spread),
     )
     return Tracks(numbers, values), own
 
@@ -221,15 +236,18 @@ def _predicted(
     chosen = np.flatnonzero(missed & (tracks.hits[:n_old] >= config.min_hits))
     # nothing that is seen there can lift a box by more than HIDDEN and CAMERA
     labels = tracks.labels[chosen]
-    best = classes.missed_weight[labels] * tracks.support[chosen] - classes.base[labels] + HIDDEN + CAMERA
-    chosen = chosen[best > config.min_log_odds]
+    moves = motion_log_odds(tracks.standing[chosen], classes.standing_doubt[labels])
+    best = classes.missed_weight[labels] * tracks.support[chosen] - classes.base[labels] + HIDDEN + CAMERA + moves
+    likely = best > config.min_log_odds
+    chosen, moves = chosen[likely], moves[likely]
     if not config.predict or not len(chosen):
         return _Predicted(chosen[:0], np.zeros(0))
     views = views_of(tracked[chosen], moment.cameras)
     there = seen_by(views, len(chosen))
-    if len(found):
-        there = there & (bev_iou(tracked[chosen], found.boxes).max(axis=1) < DUPLICATE_IOU)
-    chosen, boxes = chosen[there], tracked[chosen[there]]
+    covered = bev_iou(tracked[chosen], found.boxes) >= DUPLICATE_IOU
+    alike = tracks.labels[chosen][:, None] == found.labels[None]
+    there = there & ~(covered & alike).any(axis=1)
+    chosen, boxes, moves, covered = chosen[there], tracked[chosen[there]], moves[there], covered[there]
     if not len(chosen):
         return _Predicted(chosen, np.zeros(0))
     views = [view._replace(pixels=view.pixels[there], visible=view.visible[there]) for view in views]
@@ -245,7 +263,8 @@ def _predicted(
         classes.missed_weight[labels],
         classes.base[labels],
     )
-    good = log_odds > config.min_log_odds
+    log_odds += moves
+    good = (log_odds > config.min_log_odds) & ~(covered & (seen.log_odds[None] >= log_odds[:, None])).any(axis=1)
     return _Predicted(chosen[good], log_odds[good])
 
 
@@ -280,7 +299,9 @@ def _assemble(
     scores = to_probability(np.concatenate([own, extra]))
     # the log-odds are bounded, so a score that the memory leaves alone is taken as it was
     np.copyto(scores[:n], found.scores, where=own == alone)
-    order = np.lexsort((*boxes.T[::-1], -scores))
+    order = np.argsort(-scores, kind="stable")
+    if (np.diff(scores[order]) == 0).any():
+        order = np.lexsort((*boxes.T[::-1], -scores))
     detections = Detections3D(
         boxes[order],
         scores[order],
