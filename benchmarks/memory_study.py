@@ -132,7 +132,8 @@ def report(title: str, drives: Drives, variants: dict[str, Sequence[FusedDetecti
 def without_shapes() -> MemoryConfig:
     """The defaults, boxes left as they are."""
     base = MemoryConfig()
-    return MemoryConfig(classes={n: base.of(n).model_copy(update={"rigid": False}) for n in CLASSES})
+    left = {"rigid": False, "upright": False}
+    return MemoryConfig(classes={n: base.of(n).model_copy(update=left) for n in CLASSES})
 
 
 def without_free_camera(drives: Drives) -> Drives:
@@ -164,12 +165,17 @@ def candidates() -> dict[str, MemoryConfig]:
     grid = {}
     for seen in (0.5, 1.0, 2.0):
         for shift in (0.0, 1.0):
-            classes = {}
-            for name in CLASSES:
-                own = base.of(name)
-                update = {"seen_weight": own.seen_weight * seen, "base": own.base + shift}
-                classes[name] = own.model_copy(update=update)
-            grid[f"weight x {seen:g}, base + {shift:g}"] = MemoryConfig(classes=classes)
+            for doubt in (0.0, 1.0):
+                classes = {}
+                for name in CLASSES:
+                    own = base.of(name)
+                    update = {
+                        "seen_weight": own.seen_weight * seen,
+                        "base": own.base + shift,
+                        "standing_doubt": own.standing_doubt * doubt,
+                    }
+                    classes[name] = own.model_copy(update=update)
+                grid[f"weight x {seen:g}, base + {shift:g}, doubt x {doubt:g}"] = MemoryConfig(classes=classes)
     return grid
 
 
