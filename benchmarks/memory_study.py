@@ -1,6 +1,6 @@
 """What does a memory of past frames bring? The tables of docs/memory.md.
 
-    lcf3d run kitti:ROOT --split val --lidar results:ROOT/results/pointrcnn --camera results:ROOT/results/rrc_2d \\
+    lcf3d run kitti:ROOT --lidar results:ROOT/results/pointrcnn --camera results:ROOT/results/rrc_2d \\
         --recovery off --out alone
     python benchmarks/memory_study.py kitti:ROOT alone
 
@@ -325,7 +325,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("dataset", help="kitti:ROOT")
     parser.add_argument("run", help="folder of 'lcf3d run' without memory")
-    parser.add_argument("--split", default="val")
+    parser.add_argument("--split", help="file of ROOT/ImageSets; all frames if left out")
     parser.add_argument("--only", nargs="*", choices=tuple(QUESTIONS), default=list(QUESTIONS))
     options = parser.parse_args()
     root = options.dataset.partition(":")[2]

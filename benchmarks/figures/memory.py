@@ -62,7 +62,7 @@ STORIES = (
         58.0,
     ),
     Story(
-        "A shrub, taken for a rider at 0.9 s. A frame before, somebody looked there and saw none: it loses.",
+        "A shrub, taken for a person at 0.9 s. A frame before, somebody looked there and saw none: it loses.",
         "0005",
         (7, 8, 9, 10, 11, 12),
         (20.4, -6.1, -0.7),
