@@ -20,7 +20,7 @@ from lcf3d.structures import (
 )
 
 if TYPE_CHECKING:
-    from lcf3d.api import draw, evaluate, read_run, run
+    from lcf3d.api import draw, evaluate, evaluate_tracking, read_run, run
     from lcf3d.datasets.bag_export import write_bag
     from lcf3d.datasets.base import BaseDataset, Dataset
     from lcf3d.datasets.convert import write_kitti, write_nuscenes
@@ -97,6 +97,7 @@ _LAZY = {
     "draw": "api",
     "evaluate_generalization": "evaluation.generalization",
     "evaluate": "api",
+    "evaluate_tracking": "api",
     "export_onnx": "detectors.lidar.export",
     "load_detector": "detectors.named",
     "load_localizer": "localizers.named",
@@ -166,6 +167,7 @@ __all__ = [
     "draw",
     "evaluate",
     "evaluate_generalization",
+    "evaluate_tracking",
     "export_onnx",
     "load_detector",
     "load_localizer",

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from PIL import Image
 
     from lcf3d.datasets.base import Dataset
-    from lcf3d.evaluation.protocol import ResultSet
+    from lcf3d.evaluation.protocol import ResultSet, TrackingResult
     from lcf3d.fusion.config import FusionConfig
 
 
@@ -121,6 +121,43 @@ def evaluate(
     path = local(results)
     evaluation = open_evaluation(data, frames, EvaluationOptions(**options))
     return evaluation.read(as_files(path, data), path.name, require_missing(missing))
+
+
+def evaluate_tracking(
+    dataset: str | Dataset,
+    results: str | Path,
+    *,
+    split: str | None = None,
+    frames: Sequence[str] | None = None,
+    missing: str = "error",
+    **options: Any,
+) -> TrackingResult:
+    """Tracks measured by the dataset's own measure: what ``lcf3d eval --tracking`` does.
+
+    Args:
+        dataset: ``kind:ARGUMENT``, or a dataset, with labels that have track numbers.
+        results: a run folder of ``memory``, or another tracker's results in the dataset's form.
+        split: split of the dataset, where it is given by name.
+        frames: only these frames.
+        missing: frames without tracks: ``error``, or ``empty``.
+        options: as of `evaluate`, for example ``classes=("Car",)``.
+
+    Returns:
+        The tracks, measured: ``to_json()`` has all numbers, ``table()`` those for people.
+
+    Raises:
+        Lcf3dError: labels, tracks or options are wrong.
+    """
+    from lcf3d.datasets.base import require_missing
+    from lcf3d.datasets.opening import open_dataset
+    from lcf3d.evaluation.opening import open_tracking
+    from lcf3d.evaluation.protocol import EvaluationOptions
+    from lcf3d.remote.places import local
+    from lcf3d.run.conversion import as_files
+
+    data = open_dataset(dataset, split=split) if isinstance(dataset, str | Path) else dataset
+    measure = open_tracking(data, frames, EvaluationOptions(**options))
+    return measure.read(as_files(local(results), data), require_missing(missing))
 
 
 def draw(

@@ -5,6 +5,7 @@ import json
 import pytest
 from typer.testing import CliRunner
 
+import lcf3d
 from lcf3d.cli.app import app
 from lcf3d.datasets.opening import open_dataset
 from lcf3d.errors import ConfigError, DatasetError, FormatError
@@ -76,6 +77,9 @@ def test_command(world):
     run = CliRunner().invoke(app, ["eval", f"kitti:{world.root}", str(world.out), "--tracking", "--json"])
     assert run.exit_code == 0, run.output
     assert json.loads(run.output)["Car"]["MOTA"] == pytest.approx(100)
+    assert lcf3d.evaluate_tracking(f"kitti:{world.root}", world.out).to_json() == json.loads(run.output)
+    few = lcf3d.evaluate_tracking(f"kitti:{world.root}", world.out, frames=["0000_000001"], classes=("Car",))
+    assert "counted: 1 of the 5 frames" in few.table().notes[1]
     run = CliRunner().invoke(app, ["eval", f"kitti:{world.root / 'none'}", str(world.out), "--tracking"])
     assert isinstance(run.exception, DatasetError)
 
