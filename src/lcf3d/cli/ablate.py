@@ -46,9 +46,7 @@ def ablate(
 
     lcf3d ablate nuscenes:NUSCENES --lidar results:centerpoint.json --camera results:detections_2d.json
     """
-    import json
-
-    from lcf3d.cli.console import plain, print_table, tracked
+    from lcf3d.cli.console import plain, print_json, print_table, tracked
     from lcf3d.evaluation.ablation import ablate as measure
     from lcf3d.evaluation.opening import open_evaluation, usual_frames
     from lcf3d.run.setup import RunRequest, read_inputs
@@ -75,7 +73,7 @@ def ablate(
     rows = measure(inputs, evaluation, found.config, scores, found.localizer, progress, suppress, samples)
     scans = all(item.frame.points is not None for item in inputs)
     if json_:
-        typer.echo(json.dumps({"frames": len(inputs), "scans": scans, "rows": [r.to_json() for r in rows]}, indent=2))
+        print_json({"frames": len(inputs), "scans": scans, "rows": [r.to_json() for r in rows]})
         return
     print_table(ablation_table(rows, evaluation, len(inputs), scans))
 

@@ -35,7 +35,7 @@ def bench(
 
     lcf3d bench detectors --name pointpillars-kitti
     """
-    import json
+    from lcf3d.cli.console import print_json
 
     benches: dict[str, Callable[[], list[dict[str, Any]]]] = {
         "fusion": lambda: _fusion(seconds),
@@ -47,7 +47,7 @@ def bench(
         raise ConfigError(f"bench measures {', '.join(benches)}, got {what!r}")
     rows = benches[what]()
     if json_:
-        typer.echo(json.dumps(rows, indent=2))
+        print_json(rows)
     else:
         _print(rows)
 

@@ -39,10 +39,9 @@ def calibrate(
 
     Example: lcf3d calibrate kitti:KITTI --split val --lidar results:point_gnn --camera results:rcnn --out c.json
     """
-    import json
     from dataclasses import asdict
 
-    from lcf3d.cli.console import console, plain, print_table, tracked
+    from lcf3d.cli.console import console, plain, print_json, print_table, tracked
     from lcf3d.evaluation.calibration_study import open_study
     from lcf3d.evaluation.memory_calibration import MemoryStudy
     from lcf3d.remote.places import local_file
@@ -64,7 +63,7 @@ def calibrate(
     if json_:
         values: dict[str, Any] = {"out": str(out), "frames": len(study.frames), "folds": folds}
         values |= {"classes": [asdict(r) for r in reports], "memory": [asdict(r) for r in remembered]}
-        typer.echo(json.dumps(values, indent=2))
+        print_json(values)
         return
     print_table(calibration_table(study, calibration))
     if reports:

@@ -42,11 +42,11 @@ def check(
 
     lcf3d check folder:drive --picture check.png
     """
-    import json
     from dataclasses import asdict
 
     from rich.progress import Progress
 
+    from lcf3d.cli.console import print_json
     from lcf3d.datasets.check_picture import draw_check
     from lcf3d.datasets.opening import check_dataset
 
@@ -69,7 +69,7 @@ def check(
     if lidar is not None and camera is not None:
         findings += _alignment(dataset, split, tables, lidar, camera, quiet=json_)
     if json_:
-        typer.echo(json.dumps([asdict(finding) for finding in findings], indent=2))
+        print_json([asdict(finding) for finding in findings])
     else:
         _print(findings)
     if any(finding.severity == "error" for finding in findings):

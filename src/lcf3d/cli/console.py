@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import logging
-from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -42,6 +44,20 @@ def print_table(table: TableData) -> None:
     out.print(shown)
     for note in table.notes:
         out.print(note, soft_wrap=True)
+
+
+def print_json(value: Any) -> None:
+    """A value as JSON on stdout. JSON has no NaN and no infinity: they become null."""
+    print(json.dumps(strict(value), indent=2))
+
+
+def strict(value: Any) -> Any:
+    """A value of dictionaries, sequences and numbers with None for every number that is not finite."""
+    if isinstance(value, Mapping):
+        return {key: strict(one) for key, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [strict(one) for one in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def plain(indices: Sequence[int]) -> Iterator[int]:

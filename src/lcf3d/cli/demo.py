@@ -27,11 +27,10 @@ def demo(
     Images, scans, labels and both networks come with the package; the networks were trained on other simulated
     streets (benchmarks/train_all.py), not on this one, and the fusion's settings are the defaults.
     """
-    import json
-
     from rich.console import Console
     from rich.progress import Progress
 
+    from lcf3d.cli.console import print_json
     from lcf3d.demo.drive import LIDARS, drive, measure, shipped_detectors, write_pictures
 
     with Progress(disable=json_, console=Console(stderr=True)) as progress:
@@ -48,7 +47,7 @@ def demo(
             for path in write_pictures(seen, out / name.replace(" ", "-"))
         ]
     if json_:
-        typer.echo(json.dumps({name: _figures(result) for name, result in results.items()}, indent=2))
+        print_json({name: _figures(result) for name, result in results.items()})
     else:
         _print(results, out)
     if view:

@@ -52,10 +52,9 @@ def eval(
 
     Example: lcf3d eval nuscenes:NUSCENES tracking.json --tracking
     """
-    import json
     from time import monotonic
 
-    from lcf3d.cli.console import console, print_table
+    from lcf3d.cli.console import console, print_json, print_table
     from lcf3d.datasets.base import require_missing
     from lcf3d.datasets.opening import open_dataset
     from lcf3d.evaluation.opening import open_evaluation
@@ -90,7 +89,7 @@ def eval(
         origin = report_origin(data, dataset, places, options, monotonic() - started)
         _write(data, sets, studies, rows, content, local(out, new=True), worst, origin)
     if json_:
-        typer.echo(json.dumps(content, indent=2))
+        print_json(content)
         return
     shown = [comparison_table(rows, names, samples)] if compare else [t for one in sets for t in one.tables()]
     for table in shown:
@@ -174,10 +173,11 @@ def _write(
     origin: dict[str, str],
 ) -> None:
     """The report and its numbers."""
+    from lcf3d.cli.console import strict
     from lcf3d.evaluation.report import html_report
     from lcf3d.files import write_json, write_text
 
-    write_json(out / "metrics.json", content)
+    write_json(out / "metrics.json", strict(content))
     title = f"{studies[0].heading}: {' and '.join(study.name for study in studies)}"
     tables = [one.tables() for one in sets]
     write_text(out / "report.html", html_report(title, studies, tables, rows, data, worst, origin))

@@ -6,8 +6,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import typer
-
 if TYPE_CHECKING:
     from lcf3d.datasets.base import Dataset
     from lcf3d.evaluation.protocol import EvaluationOptions
@@ -26,13 +24,11 @@ def eval_tracking(
     Raises:
         Lcf3dError: labels without track numbers, no tracks, or tracks of other frames.
     """
-    import json
-
-    from lcf3d.cli.console import print_table
+    from lcf3d.cli.console import print_json, print_table
     from lcf3d.evaluation.opening import open_tracking
 
     measured = open_tracking(dataset, frame_ids, options).read(results, missing)
     if as_json:
-        typer.echo(json.dumps(measured.to_json(), indent=2))
+        print_json(measured.to_json())
         return
     print_table(measured.table())

@@ -39,11 +39,10 @@ def generalize(
     --task "kitti->kitti kitti:KITTI split=val lidar=results:point_gnn camera=results:rcnn_2d"
     --task "nuscenes->kitti kitti:KITTI split=val lidar=results:nus_on_kitti camera=results:rcnn_2d"
     """
-    import json
-
     from rich.console import Console
     from rich.progress import Progress
 
+    from lcf3d.cli.console import print_json
     from lcf3d.evaluation.domain_report import run_tasks, to_json
     from lcf3d.run.settings import build_config
 
@@ -56,7 +55,7 @@ def generalize(
 
         results = run_tasks(task, settings, out, tuple(class_ or ()), begin)
     if json_:
-        typer.echo(json.dumps(to_json(results), indent=2))
+        print_json(to_json(results))
         return
     Console().print(_table(results))
     typer.echo(f"report in {out / 'report.html'}")

@@ -45,8 +45,7 @@ def live(
 
     lcf3d live bag:drive.mcap --lidar topic:/lidar/objects --camera topic:/front/objects --pictures seen/
     """
-    import json
-
+    from lcf3d.cli.console import print_json
     from lcf3d.live.outputs import Outputs
     from lcf3d.live.replay import in_order, make_fuser, replay
     from lcf3d.live.warming import settle_memory
@@ -82,7 +81,7 @@ def live(
     )  # fmt: skip
     made = outputs.close()
     if json_:
-        typer.echo(json.dumps({**report.to_json(), "outputs": made, "left_out": notes}, indent=2))
+        print_json({**report.to_json(), "outputs": made, "left_out": notes})
     else:
         _print(report, [*made, *notes])
 

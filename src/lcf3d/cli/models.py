@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from lcf3d.cli.console import print_json
 from lcf3d.detectors.published import PublishedModel
 from lcf3d.errors import ConfigError
 
@@ -37,7 +37,7 @@ def models(
     elif action == "list":
         if as_json:
             entries = [{**asdict(m), "sha256_begins": m.digest_prefix} for m in PUBLISHED]
-            typer.echo(json.dumps(entries, indent=2))
+            print_json(entries)
             return
         for model in PUBLISHED:
             typer.echo("\n    ".join(_lines(model)))

@@ -108,12 +108,10 @@ def _measure(
     json_: bool,
 ) -> list[str]:
     """Measure, print and write tables one after the other; the rows that failed, not those that lack something."""
-    import json
-
     from rich.console import Console
     from rich.progress import Progress
 
-    from lcf3d.cli.console import print_table
+    from lcf3d.cli.console import print_json, print_table
     from lcf3d.files import write_json, write_text
     from lcf3d.paper.report import markdown, table_data, to_json
     from lcf3d.paper.rows import FAILED, given_results, measured_rows, needed_rows
@@ -138,22 +136,22 @@ def _measure(
                 progress.stop()
                 print_table(data)
     if json_:
-        typer.echo(json.dumps(contents if len(contents) > 1 else contents[0], indent=2))
+        print_json(contents if len(contents) > 1 else contents[0])
     rows_of = [(content["table"], row) for content in contents for row in content["rows"]]
     return [f"{t}: {row['name']}" for t, row in rows_of if any(n.startswith(FAILED) for n in row["notes"])]
 
 
 def _print_list(json_: bool) -> None:
     """The tables, what they are measured on and about how long that takes."""
-    import json
     from dataclasses import asdict
 
+    from lcf3d.cli.console import print_json
     from lcf3d.paper.estimates import DATA, about
     from lcf3d.paper.tables import paper_tables
 
     tables = paper_tables()
     if json_:
-        typer.echo(json.dumps([asdict(one) for one in tables.values()], indent=2))
+        print_json([asdict(one) for one in tables.values()])
         return
     for one in tables.values():
         numbers = sum(value is not None for r in one.rows for value in r.values)

@@ -85,8 +85,7 @@ def run(
 
     lcf3d run nuscenes:NUSCENES --lidar results:centerpoint.json --camera results:detections_2d.json --out fused
     """
-    import json
-
+    from lcf3d.cli.console import print_json
     from lcf3d.formats.bag_files import require_writer
     from lcf3d.remote.places import local
     from lcf3d.remote.urls import is_url, url_of
@@ -138,7 +137,7 @@ def run(
         "out": url_of(out) or str(out),
     }
     if json_:
-        typer.echo(json.dumps(counts, indent=2))
+        print_json(counts)
     else:
         _print(counts)
 
