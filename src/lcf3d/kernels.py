@@ -2,15 +2,20 @@
 
 numba itself refuses to work where it finds no place for its cache (a package owned by root, a home that cannot be
 written to), and fails on cache files that are cut off or cannot be written. Here a function is then compiled anew.
+numba also knows a cached function by its own file alone, and would go on with what it called before where a function
+or a constant of another file has changed. Here it is known by all that it uses.
 """
 
 from __future__ import annotations
 
+import hashlib
 import logging
 from collections.abc import Callable
+from types import CodeType
 from typing import Any, overload
 
 import numba
+import numpy as np
 
 log = logging.getLogger(__name__)
 
@@ -43,8 +48,32 @@ def _compiled(function: Any, inline: str) -> Any:
         return numba.njit(nogil=True, inline=inline, no_cfunc_wrapper=True)(function)
     cache = getattr(compiled, "_cache", None)
     if cache is not None:
-        compiled._cache = _ForgivingCache(cache)
+        compiled._cache = _ForgivingCache(cache, compiled.py_func)
     return compiled
+
+
+def _digest(function: Any) -> str:
+    """A number for a function with all compiled functions that it calls and all constants that they use."""
+    found = hashlib.sha256()
+    _add(found, function, set())
+    return found.hexdigest()
+
+
+def _add(found: Any, function: Any, seen: set[Any]) -> None:
+    """Add code and constants of a function, and of those that it calls, in the order of their names."""
+    if function in seen:
+        return
+    seen.add(function)
+    code = function.__code__
+    found.update(code.co_code + repr([one for one in code.co_consts if not isinstance(one, CodeType)]).encode())
+    for name in sorted(code.co_names):
+        value = function.__globals__.get(name)
+        if hasattr(value, "py_func"):
+            _add(found, value.py_func, seen)
+        elif isinstance(value, int | float | complex | str | bytes | tuple | np.generic):
+            found.update(f"{name}={value!r}".encode())
+        elif isinstance(value, np.ndarray):
+            found.update(f"{name}={value.dtype}{value.shape}".encode() + value.tobytes())
 
 
 class _ForgivingCache:
@@ -52,13 +81,22 @@ class _ForgivingCache:
 
     Args:
         cache: numba's.
+        function: the function, which is looked at when it is first needed: then all that it calls is there.
     """
 
-    def __init__(self, cache: Any) -> None:
-        self._cache = cache
+    def __init__(self, cache: Any, function: Any) -> None:
+        self._cache, self._function = cache, function
+
+    def _name_all(self) -> None:
+        """Let what is kept hold for the function with all that it uses."""
+        file: Any = getattr(self._cache, "_cache_file", None)
+        if self._function is not None and hasattr(file, "_source_stamp"):
+            file._source_stamp = (file._source_stamp, _digest(self._function))
+        self._function = None
 
     def load_overload(self, signature: Any, target: Any) -> Any:
         """Compiled code from the disk, None where there is none that can be used."""
+        self._name_all()
         try:
             return self._cache.load_overload(signature, target)
         except Exception:
@@ -71,6 +109,7 @@ class _ForgivingCache:
 
     def save_overload(self, signature: Any, data: Any) -> None:
         """Keep compiled code."""
+        self._name_all()
         try:
             self._cache.save_overload(signature, data)
         except Exception as error:
