@@ -1,5 +1,6 @@
 import json
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from lcf3d.datasets.nuscenes import NuscenesDataset
 from lcf3d.errors import ConfigError, DatasetError, FormatError
 from lcf3d.evaluation.nuscenes_task import NuscenesEvaluation
 from lcf3d.evaluation.protocol import EvaluationOptions
-from lcf3d.formats.nuscenes import write_submission
+from lcf3d.formats.nuscenes import read_submission, write_submission
 from tests.datasets.nuscenes_world import write_world
 
 
@@ -88,3 +89,22 @@ def test_bad_input(root: Path, results: Path, tmp_path: Path) -> None:
         lcf3d("eval", f"nuscenes:{root}", tmp_path / "none.json")
     with pytest.raises(ConfigError, match="--iou does not go with"):
         lcf3d("eval", f"nuscenes:{root}", results, "--iou", "car=0.5")
+
+
+@pytest.mark.parametrize("missing", ["error", "empty"])
+def test_boxes_are_measured_as_they_are(
+    root: Path, results: Path, missing: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Boxes without an attribute get none, whatever is done about samples that the file lacks."""
+    content = json.loads(results.read_text())
+    for box in chain(*content["results"].values()):
+        box["attribute_name"] = ""
+    results.write_text(json.dumps(content))
+    evaluation = NuscenesEvaluation(NuscenesDataset(root), None, EvaluationOptions())
+    measured, official = [], evaluation.official
+    monkeypatch.setattr(evaluation, "official", lambda boxes, *meta: measured.append(boxes) or official(boxes, *meta))
+    evaluation.read(results, "x", missing)
+    written, _ = read_submission(results)
+    assert (measured[0].attributes == -1).all()
+    np.testing.assert_array_equal(measured[0].rotations, written.rotations)
+    np.testing.assert_array_equal(measured[0].velocities, written.velocities)

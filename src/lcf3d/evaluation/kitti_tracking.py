@@ -14,8 +14,8 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from lcf3d.datasets.kitti_sequences import sequence_of
-from lcf3d.errors import ConfigError, DatasetError, FormatError
-from lcf3d.evaluation.protocol import EvaluationOptions, TableData, frames_note, refuse_options
+from lcf3d.errors import DatasetError, FormatError
+from lcf3d.evaluation.protocol import EvaluationOptions, TableData, frames_note, tracked_classes
 from lcf3d.evaluation.tracking import Averaged, Clear, Hota, TrackedFrames, averaged, clear, hota, track_scores
 from lcf3d.files import list_files
 from lcf3d.formats.kitti import KittiObjects
@@ -84,11 +84,7 @@ class KittiTracking:
     """
 
     def __init__(self, dataset: Any, frame_ids: Sequence[str] | None, options: EvaluationOptions) -> None:
-        refuse_options("--tracking", options, "iou", "front", "nds_hat")
-        unknown = [name for name in options.classes if name not in CLASSES]
-        if unknown:
-            raise ConfigError(f"--tracking does not know class {unknown[0]!r}; it measures {', '.join(CLASSES)}")
-        self.classes = options.classes or CLASSES
+        self.classes = tracked_classes(options, CLASSES, "it measures")
         self.labels = dataset.root / "training" / "label_02"
         if not self.labels.is_dir():
             raise DatasetError(

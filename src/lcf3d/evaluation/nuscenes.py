@@ -270,7 +270,6 @@ def aligned(predictions: GlobalBoxes, tokens: tuple[str, ...]) -> GlobalBoxes:
     Raises:
         FormatError: predictions of other samples than these, or none for some of them.
     """
-    position = {token: i for i, token in enumerate(tokens)}
     missing = set(tokens) - set(predictions.sample_tokens)
     if missing and len(missing) == len(tokens):
         raise FormatError(
@@ -285,25 +284,14 @@ def aligned(predictions: GlobalBoxes, tokens: tuple[str, ...]) -> GlobalBoxes:
         )
     # a run on a part of the samples lists the others without boxes
     filled = {predictions.sample_tokens[i] for i in np.unique(predictions.samples).tolist()}
-    unknown = [token for token in predictions.sample_tokens if token in filled and token not in position]
+    strange = filled.difference(tokens)
+    unknown = [token for token in predictions.sample_tokens if token in strange]
     if unknown:
         raise FormatError(
             f"the results hold boxes of {len(unknown)} samples that are not in this split, the first is {unknown[0]}; "
             "check version and split"
         )
-    numbers = np.array([position.get(token, -1) for token in predictions.sample_tokens], dtype=np.int64)
-    return GlobalBoxes(
-        tokens,
-        numbers[predictions.samples],
-        predictions.translations,
-        predictions.sizes,
-        predictions.rotations,
-        predictions.velocities,
-        predictions.labels,
-        predictions.scores,
-        predictions.attributes,
-        predictions.point_counts,
-    )
+    return predictions.numbered(tokens)
 
 
 def rack_filter(tables: NuscenesTables, sample_rows: IntArray) -> Any:

@@ -16,7 +16,7 @@ from lcf3d.evaluation.nuscenes import NuscenesMetrics, evaluate_nuscenes
 from lcf3d.evaluation.protocol import EvaluationOptions, TableData
 from lcf3d.formats.nuscenes import read_submission
 from lcf3d.formats.nuscenes_boxes import GlobalBoxes, detections_from_global, global_from_detections, split_by_sample
-from lcf3d.structures import NUSCENES_CLASSES, Detections3D
+from lcf3d.structures import Detections3D
 
 FRONT_CAMERA = "CAM_FRONT"
 ERROR_TITLES = ("ATE", "ASE", "AOE", "AVE", "AAE")
@@ -82,7 +82,8 @@ class NuscenesEvaluation(DistanceEvaluation):
         file = path / "results.json" if path.is_dir() else path
         boxes, meta = read_submission(file)
         if missing == "empty":
-            boxes = _with_samples(boxes, self.frame_ids)
+            boxes = boxes.numbered(self.frame_ids)
+            boxes = boxes[boxes.samples >= 0]
         metrics = self.official(boxes, dict(meta))
         by_token = split_by_sample(boxes)
         found = [
@@ -131,12 +132,3 @@ class NuscenesResultSet(DistanceResultSet):
         if absent:
             notes.append(f"no ground truth (counts as AP 0, errors 1): {', '.join(absent)}")
         return [TableData(title, columns, rows, tuple(notes))]
-
-
-def _with_samples(boxes: GlobalBoxes, tokens: Sequence[str]) -> GlobalBoxes:
-    """The boxes of ``tokens``, none where there are none; those of other samples are left out."""
-    by_token = split_by_sample(boxes)
-    empty = Detections3D.empty(NUSCENES_CLASSES)
-    identity = np.eye(4)
-    found = {t: detections_from_global(by_token[t], identity) if t in by_token else empty for t in tokens}
-    return global_from_detections(found, dict.fromkeys(tokens, identity), tokens)

@@ -7,14 +7,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from lcf3d.errors import ConfigError
 from lcf3d.evaluation.nuscenes_task import NuscenesEvaluation
 from lcf3d.evaluation.nuscenes_tracking import MEASURES, NuscenesTrackingMetrics, evaluate_nuscenes_tracking
-from lcf3d.evaluation.protocol import EvaluationOptions, TableData, frames_note, refuse_options
+from lcf3d.evaluation.protocol import EvaluationOptions, TableData, frames_note, tracked_classes
 from lcf3d.formats.nuscenes import TRACKING_CLASSES, read_tracking
-from lcf3d.formats.nuscenes_boxes import GlobalBoxes
 from lcf3d.structures import IntArray
 
 COUNTS = ("gt", "mt", "ml", "tp", "fp", "fn", "ids", "frag")
@@ -34,13 +31,7 @@ class NuscenesTracking:
     """
 
     def __init__(self, dataset: Any, frame_ids: Sequence[str] | None, options: EvaluationOptions) -> None:
-        refuse_options("--tracking", options, "iou", "front", "nds_hat")
-        unknown = [name for name in options.classes if name not in TRACKING_CLASSES]
-        if unknown:
-            raise ConfigError(
-                f"--tracking does not know class {unknown[0]!r}; nuScenes tracks {', '.join(TRACKING_CLASSES)}"
-            )
-        self.classes = options.classes or TRACKING_CLASSES
+        self.classes = tracked_classes(options, TRACKING_CLASSES, "nuScenes tracks")
         self.tables = dataset.tables
         usual = NuscenesEvaluation(dataset, frame_ids, EvaluationOptions())
         self.rows: IntArray = usual.rows
@@ -55,7 +46,8 @@ class NuscenesTracking:
         """
         boxes, ids, meta = read_tracking(path / "tracking.json" if path.is_dir() else path)
         if missing == "empty" and set(self.tokens) & set(boxes.sample_tokens):
-            boxes, ids = _with_samples(boxes, ids, self.tokens)
+            boxes = boxes.numbered(self.tokens)
+            boxes, ids = boxes[boxes.samples >= 0], ids[boxes.samples >= 0]
         metrics = evaluate_nuscenes_tracking(self.tables, self.rows, boxes, ids, self.classes, meta)
         scenes = np.unique(self.tables.samples.scenes[self.rows])
         every = int(np.isin(self.tables.samples.scenes, scenes).sum())
@@ -99,15 +91,3 @@ def _cell(measure: str, value: float) -> str:
     if np.isnan(value):
         return "-"
     return f"{value:.0f}" if measure in COUNTS else f"{value:.1f}" if measure == "faf" else f"{value:.3f}"
-
-
-def _with_samples(
-    boxes: GlobalBoxes, ids: NDArray[np.str_], tokens: Sequence[str]
-) -> tuple[GlobalBoxes, NDArray[np.str_]]:
-    """The boxes of ``tokens`` and their tracks; samples that the file lacks have none."""
-    position = {token: i for i, token in enumerate(tokens)}
-    places = np.array([position.get(token, -1) for token in boxes.sample_tokens], dtype=np.int64)[boxes.samples]
-    own = boxes[places >= 0]
-    columns = {name: getattr(own, name) for name in own.__dataclass_fields__}
-    columns.update(sample_tokens=tuple(tokens), samples=places[places >= 0])
-    return GlobalBoxes(**columns), ids[places >= 0]

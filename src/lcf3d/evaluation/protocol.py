@@ -170,6 +170,24 @@ def refuse_options(what: str, options: EvaluationOptions, *names: str) -> None:
             raise ConfigError(f"--{flag} does not go with {what}; leave it out")
 
 
+def tracked_classes(options: EvaluationOptions, known: Sequence[str], who: str) -> tuple[str, ...]:
+    """The classes whose tracks are to be measured: those asked for, else all that are known.
+
+    Args:
+        options: what was asked for.
+        known: classes of the measure.
+        who: says of it what it does with these, for messages.
+
+    Raises:
+        ConfigError: an unknown class, or an option for other evaluations.
+    """
+    refuse_options("--tracking", options, "iou", "front", "nds_hat")
+    unknown = [name for name in options.classes if name not in known]
+    if unknown:
+        raise ConfigError(f"--tracking does not know class {unknown[0]!r}; {who} {', '.join(known)}")
+    return options.classes or tuple(known)
+
+
 def frames_note(counted: int, every: int, drives: int, name: str) -> str:
     """How many frames of how many a measure counts, in a sentence; ``name`` is what the data set calls its drives."""
     of = f"frames of {drives} {name}{'' if drives == 1 else 's'}"

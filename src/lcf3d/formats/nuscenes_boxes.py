@@ -105,6 +105,12 @@ class GlobalBoxes:
         """The same boxes, all as boxes of ``sample_tokens[sample]``."""
         return replace(self, sample_tokens=tuple(sample_tokens), samples=np.full(len(self), sample, dtype=np.int64))
 
+    def numbered(self, sample_tokens: Sequence[str]) -> GlobalBoxes:
+        """The same boxes, in their order, as boxes of other samples; ``samples`` of those that are of none is -1."""
+        position = {token: i for i, token in enumerate(sample_tokens)}
+        numbers = np.array([position.get(token, -1) for token in self.sample_tokens], dtype=np.int64)
+        return replace(self, sample_tokens=tuple(sample_tokens), samples=numbers[self.samples])
+
 
 def detections_from_global(boxes: GlobalBoxes, lidar_from_global: FloatArray) -> Detections3D:
     """Boxes of one sample in its canonical LiDAR frame.
