@@ -131,9 +131,7 @@ def report(title: str, drives: Drives, variants: dict[str, Sequence[FusedDetecti
 
 def without_shapes() -> MemoryConfig:
     """The defaults, boxes left as they are."""
-    base = MemoryConfig()
-    left = {"rigid": False, "upright": False}
-    return MemoryConfig(classes={n: base.of(n).model_copy(update=left) for n in CLASSES})
+    return MemoryConfig().with_classes(CLASSES, rigid=False, upright=False)
 
 
 def without_free_camera(drives: Drives) -> Drives:

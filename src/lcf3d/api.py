@@ -85,6 +85,13 @@ def run(
     }
 
 
+def _opened(dataset: str | Dataset, split: str | None) -> Dataset:
+    """The dataset of that name; one that is open already stays as it is."""
+    from lcf3d.datasets.opening import open_dataset
+
+    return open_dataset(dataset, split=split) if isinstance(dataset, str | Path) else dataset
+
+
 def evaluate(
     dataset: str | Dataset,
     results: str | Path,
@@ -111,13 +118,12 @@ def evaluate(
         Lcf3dError: labels, results or options are wrong.
     """
     from lcf3d.datasets.base import require_missing
-    from lcf3d.datasets.opening import open_dataset
     from lcf3d.evaluation.opening import open_evaluation
     from lcf3d.evaluation.protocol import EvaluationOptions
     from lcf3d.remote.places import local
     from lcf3d.run.conversion import as_files
 
-    data = open_dataset(dataset, split=split) if isinstance(dataset, str | Path) else dataset
+    data = _opened(dataset, split)
     path = local(results)
     evaluation = open_evaluation(data, frames, EvaluationOptions(**options))
     return evaluation.read(as_files(path, data), path.name, require_missing(missing))
@@ -149,13 +155,12 @@ def evaluate_tracking(
         Lcf3dError: labels, tracks or options are wrong.
     """
     from lcf3d.datasets.base import require_missing
-    from lcf3d.datasets.opening import open_dataset
     from lcf3d.evaluation.opening import open_tracking
     from lcf3d.evaluation.protocol import EvaluationOptions
     from lcf3d.remote.places import local
     from lcf3d.run.conversion import as_files
 
-    data = open_dataset(dataset, split=split) if isinstance(dataset, str | Path) else dataset
+    data = _opened(dataset, split)
     measure = open_tracking(data, frames, EvaluationOptions(**options))
     return measure.read(as_files(local(results), data), require_missing(missing))
 

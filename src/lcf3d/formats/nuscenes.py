@@ -26,7 +26,8 @@ MAX_BOXES_PER_SAMPLE = 500
 TRACKING_CLASSES = ("bicycle", "bus", "car", "motorcycle", "pedestrian", "trailer", "truck")
 """The classes that the nuScenes tracking benchmark knows."""
 
-_META = {"use_camera": True, "use_lidar": True, "use_radar": False, "use_map": False, "use_external": False}
+META = {"use_camera": True, "use_lidar": True, "use_radar": False, "use_map": False, "use_external": False}
+"""What a submission says of its inputs, unless told otherwise."""
 _UNKNOWN = -2
 
 
@@ -35,12 +36,14 @@ class _Form(NamedTuple):
 
     Attributes:
         title: what the file is.
+        kind: ``detection`` or ``tracking``: how the keys of name and score begin.
         numbers: keys of numbers, and their shapes.
         names: keys of names, and what each is as a number.
         texts: keys of texts.
     """
 
     title: str
+    kind: str
     numbers: dict[str, tuple[int, ...]]
     names: dict[str, dict[str, int]]
     texts: tuple[str, ...] = ()
@@ -50,6 +53,7 @@ _BOX: dict[str, tuple[int, ...]] = {"translation": (3,), "size": (3,), "rotation
 _CLASSES = {name: i for i, name in enumerate(NUSCENES_CLASSES)}
 _DETECTIONS = _Form(
     "a nuScenes submission",
+    "detection",
     {**_BOX, "detection_score": ()},
     {
         "detection_name": _CLASSES,
@@ -58,6 +62,7 @@ _DETECTIONS = _Form(
 )
 _TRACKS = _Form(
     "a nuScenes tracking submission",
+    "tracking",
     {**_BOX, "tracking_score": ()},
     {"tracking_name": {name: _CLASSES[name] for name in TRACKING_CLASSES}},
     ("tracking_id",),
@@ -159,7 +164,7 @@ def write_submission(path: Path, boxes: GlobalBoxes, meta: Mapping[str, Any] | N
                 "attribute_name": "" if boxes.attributes[i] < 0 else NUSCENES_ATTRIBUTES[boxes.attributes[i]],
             }
         )
-    write_text(path, json.dumps({"meta": dict(_META if meta is None else meta), "results": results}) + "\n")
+    write_text(path, json.dumps({"meta": dict(META if meta is None else meta), "results": results}) + "\n")
 
 
 def _read_sample(path: Path, token: str, boxes: Any, max_boxes: int, form: _Form) -> dict[str, Any]:
@@ -193,7 +198,7 @@ def _read_sample(path: Path, token: str, boxes: Any, max_boxes: int, form: _Form
                 raise FormatError(f"{path}: {key} of a box of sample {token} must be text or a whole number")
             arrays[key] = [str(box[key]) for box in boxes]
     except KeyError as error:
-        other = "detection_name" if form is _TRACKS else "tracking_name"
+        other = "detection_name" if form.kind == "tracking" else "tracking_name"
         hint = f": it has {other!r}, so this is another kind of file" if any(other in box for box in boxes) else ""
         raise FormatError(f"{path}: a box of sample {token} has no {error.args[0]!r}{hint}") from None
     except TypeError:
@@ -219,8 +224,6 @@ def _join(path: Path, tokens: list[str], parts: list[dict[str, Any]], form: _For
             token = tokens[samples[np.argmax(bad)]]
             raise FormatError(f"{path}: {int(bad.sum())} boxes, the first of sample {token}, have a {what}")
     names = {key: np.concatenate([part[key] for part in parts] + [np.zeros(0, np.int64)]) for key in form.names}
-    labels = names.get("detection_name", names.get("tracking_name"))
-    assert labels is not None
     none = np.full(len(samples), -1, dtype=np.int64)
     return GlobalBoxes(
         tuple(tokens),
@@ -229,8 +232,8 @@ def _join(path: Path, tokens: list[str], parts: list[dict[str, Any]], form: _For
         joined["size"],
         joined["rotation"],
         joined["velocity"],
-        labels,
-        joined["detection_score" if "detection_score" in joined else "tracking_score"],
+        names[f"{form.kind}_name"],
+        joined[f"{form.kind}_score"],
         names.get("attribute_name", none),
         none,
     )

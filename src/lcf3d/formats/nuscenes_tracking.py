@@ -11,11 +11,9 @@ import numpy as np
 
 from lcf3d.errors import FormatError
 from lcf3d.files import write_text
-from lcf3d.formats.nuscenes import MAX_BOXES_PER_SAMPLE, TRACKING_CLASSES
+from lcf3d.formats.nuscenes import MAX_BOXES_PER_SAMPLE, META, TRACKING_CLASSES
 from lcf3d.formats.nuscenes_boxes import global_from_detections
 from lcf3d.structures import Detections3D, FloatArray, IntArray
-
-_META = {"use_camera": True, "use_lidar": True, "use_radar": False, "use_map": False, "use_external": False}
 
 
 def write_tracking(
@@ -66,4 +64,4 @@ def write_tracking(
                     "tracking_score": float(boxes.scores[i]),
                 }
             )
-    write_text(path, json.dumps({"meta": _META, "results": results}) + "\n")
+    write_text(path, json.dumps({"meta": META, "results": results}) + "\n")

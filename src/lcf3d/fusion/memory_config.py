@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Annotated, NamedTuple
+from collections.abc import Iterable, Sequence
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
@@ -118,6 +118,11 @@ class MemoryConfig(BaseModel):
         """The settings of a class."""
         known = self.classes.get(class_name)
         return known or _KIND_OF.get(class_name.lower(), ClassMemory())
+
+    def with_classes(self, class_names: Iterable[str], **changes: Any) -> MemoryConfig:
+        """The same with some settings of `ClassMemory` changed for the named classes."""
+        changed = {name: self.of(name).model_copy(update=changes) for name in class_names}
+        return self.model_copy(update={"classes": {**self.classes, **changed}})
 
     def columns(self, class_names: Sequence[str]) -> ClassColumns:
         """The settings of some classes, one column a setting."""

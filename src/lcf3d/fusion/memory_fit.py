@@ -48,10 +48,8 @@ class Remembered(NamedTuple):
 
 def gathering(class_names: Sequence[str]) -> MemoryConfig:
     """Settings under which the memory tells all that `remembered_boxes` needs: predicted boxes however unlikely."""
-    base = MemoryConfig()
-    small = {"seen_weight": SMALL, "missed_weight": SMALL, "base": 0.0, "standing_doubt": 0.0}
-    classes = {name: base.of(name).model_copy(update=small) for name in class_names}
-    return MemoryConfig(classes=classes, min_log_odds=LOWEST)
+    likely = MemoryConfig(min_log_odds=LOWEST)
+    return likely.with_classes(class_names, seen_weight=SMALL, missed_weight=SMALL, base=0.0, standing_doubt=0.0)
 
 
 def remembered_boxes(results: Sequence[FusedDetections]) -> Remembered:

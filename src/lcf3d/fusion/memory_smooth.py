@@ -60,8 +60,7 @@ def smooth_sequence(
 def _without_motion(config: MemoryConfig, frames: Sequence[tuple[Frame, FusedDetections]]) -> MemoryConfig:
     """The same, but how an object moves says nothing: it is one piece of evidence, and the other direction has it."""
     names = dict.fromkeys(name for _, fused in frames for name in fused.detections.class_names)
-    classes = {name: config.of(name).model_copy(update={"standing_doubt": 0.0}) for name in names}
-    return config.model_copy(update={"classes": {**config.classes, **classes}})
+    return config.with_classes(names, standing_doubt=0.0)
 
 
 def _run(

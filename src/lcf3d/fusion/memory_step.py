@@ -181,7 +181,7 @@ def _updated(
     own = seen.match.copy()
     own[new] = len(tracks) + np.arange(n_new)
     values = np.empty((len(tracks) + n_new, tracks.values.shape[1]))
-    numbers = np.empty((len(values), 4), dtype=np.int64)
+    numbers = np.empty((len(values), tracks.numbers.shape[1]), dtype=np.int64)
     values[: len(tracks)], numbers[: len(tracks)] = tracks.values, tracks.numbers
     shares = np.zeros(len(found))
     time = moment.time_s
